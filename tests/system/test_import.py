@@ -64,12 +64,24 @@ def test_it_is_a_run_for_the_other_commands(imported, bench, tmp_path):
     assert bench("runs", "compare", imported, imported)[0] == 0
 
 
+def test_a_model_with_time_takes_the_times_of_the_file(bench, imported):
+    options = ("identify", imported, "--model", "hammerstein", "-o", "static=polynomial", "-o", "dynamics=lag")
+    code, out, err = bench(*options)
+    assert code == 0, err
+    assert "time constant" in out
+
+
 def test_without_times_rows_are_a_second_apart_and_that_is_said(bench, tmp_path):
     path = tmp_path / "plain.csv"
-    path.write_text("a,b\n" + "\n".join(f"{i},{2 * i}" for i in range(12)))
+    path.write_text("a,b\n" + "\n".join(f"{i},{2 * i + i % 3}" for i in range(12)))
     code, out, _ = bench("runs", "import", path, "--input", "a", "--output", "b", "--out", tmp_path / "runs")
     assert code == 0
     assert "rows are 1 s apart" in out
+    # These are no times to fit a model with.
+    (folder,) = (tmp_path / "runs").iterdir()
+    code, _, err = bench("identify", folder, "--model", "hammerstein")
+    assert code == 2
+    assert "--time" in err
 
 
 @pytest.mark.parametrize(

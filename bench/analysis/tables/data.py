@@ -357,7 +357,8 @@ def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int, time
         own = [name for name in own if np.isfinite(table[name]).all()]
         names = [*names, *own[:1]]
         values = {name: table[name] for name in names}
-        units = {name: record.unit(name) for name in names}
+        # The unit of a signal without one is 1.
+        units = {name: unit if (unit := record.unit(name)) != "1" else "" for name in names}
         if chosen == _STEPS and len(table) < at_least and (ticks := record.count("telemetry")) >= at_least:
             other = f"; --format table={_TELEMETRY} takes the {ticks} readings within its steps"
             _check_rows(path, len(table), at_least, other)

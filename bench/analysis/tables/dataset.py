@@ -20,6 +20,7 @@ from bench.analysis.tables.times import rows_in_time, seconds_of
 from bench.base import ConfigurationError, DataError, Floats
 from bench.identification import Advice, ModelFile
 from bench.models import TimedModel, overwritten_from
+from bench.record import Record
 
 Flags = npt.NDArray[np.bool_]
 
@@ -34,6 +35,8 @@ Derivation: one sweep travels once, and noise of 2 % adds 2 % a row; branches ar
 NO_TIMES = "none"
 """Stands for a column of times where a file's own is to be left out."""
 
+TIME_COLUMN = "time_column"
+"""Parameter of an imported run: the column of times of its file."""
 # Heads that name a column of times.
 _TIMES = ("time", "t", "Time", "time_s", "t_s", "Time_s", "timestamp", "Timestamp", "datetime")
 
@@ -287,10 +290,15 @@ def read_for(
 def time_names(path: Path, model: ModelFile | None = None) -> tuple[str, ...]:
     """Return the columns that may hold the times of a file; that of the data of a model first.
 
-    Of a run no other is: its steps are quasi-static.
+    Of a run these are the times of its telemetry, and of rows that were imported with times: its own steps are
+    quasi-static.
     """
     own = None if model is None else model.provenance.get("time")
-    return (*([str(own)] if own else []), *(() if is_run(path) else _TIMES))
+    names: tuple[str, ...] = _TIMES
+    if is_run(path):
+        with Record(path) as record:
+            names = ("t", "finished") if TIME_COLUMN in record.meta["parameters"] else ("t",)
+    return (*([str(own)] if own else []), *names)
 
 
 def check_unit(expected: str, column: Quantity) -> None:

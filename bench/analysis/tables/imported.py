@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bench.analysis.tables.data import find_elsewhere, is_run
-from bench.analysis.tables.dataset import ColumnNames, read_dataset, time_names
+from bench.analysis.tables.dataset import TIME_COLUMN, ColumnNames, read_dataset, time_names
 from bench.analysis.tables.reading.heads import split_unit
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.base import ConfigurationError, DataError, Floats, redacted_command, wall_time
@@ -77,12 +77,15 @@ def import_file(
     except DataError as error:
         # Those that nobody asked for may be of several records.
         times, remark = None, f"{error}: left out, rows are 1 s apart"
-    times = np.arange(1.0, data.inputs.size + 1.0) if times is None else times
     quantities = data.input, data.output, *data.others
     signals = [_signal(quantity.name, quantity.unit) for quantity in quantities]
     assumptions = [data.assumptions, remark]
     folder = make_folder(out, f"{_word(path.stem)}-{PROTOCOL}")
-    meta = _metadata(path, folder.name, title, signals, dict(zip(("input", "output"), wanted, strict=False)), times)
+    columns = dict(zip(("input_column", "output_column"), wanted, strict=False))
+    if times is not None and data.time is not None:
+        columns[TIME_COLUMN] = data.time.name
+    times = np.arange(1.0, data.inputs.size + 1.0) if times is None else times
+    meta = _metadata(path, folder.name, title, signals, columns, times)
     # A file that is still there needs no row to be durable before the next.
     places = [path, *(place[0] for name in wanted if (place := find_elsewhere(path, name)))]
     files = {file.name: file.read_bytes() for file in places}
@@ -110,7 +113,7 @@ def _word(text: str) -> str:
 
 
 def _metadata(
-    path: Path, run: str, title: str, signals: Sequence[Signal], ends: Mapping[str, str], times: Floats
+    path: Path, run: str, title: str, signals: Sequence[Signal], columns: Mapping[str, str], times: Floats
 ) -> dict[str, Any]:
     content = path.read_bytes()
     span = {signal.name: signal for signal in signals}
@@ -128,7 +131,7 @@ def _metadata(
         "parameters": {
             "source": str(path),
             "sha256": hashlib.sha256(content).hexdigest(),
-            **{f"{end}_column": column for end, column in ends.items()},
+            **columns,
         },
         "changed": {},
         "overrides": {},

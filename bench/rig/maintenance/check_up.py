@@ -373,8 +373,8 @@ def _exercise(
     noise = deviation([values[signal] for values in quick])
     begin, target = _mean(quick, signal), exercise_setpoint(role, device.limits)
     # Of a reading in another unit only that it moves is known, which is looked at in the end.
-    way = target - begin if read.unit == device.limits.unit else math.nan
-    near = max(_SIGNIFICANT * noise, _NEAR * abs(way)) if way == way else -1.0
+    way = target - begin if read.unit == device.limits.unit else None
+    near = -1.0 if way is None else max(_SIGNIFICANT * noise, _NEAR * abs(way))
     start, value = clock.now(), begin
     seen: list[dict[str, float]] = []
 
@@ -393,11 +393,11 @@ def _exercise(
         live, _ = _repeat(source.glance, GLANCES, clock)
     finally:
         device.safe()
-    if way != way:
+    if way is None:
         value = _mean(live, signal)
     moved, on = value - begin, _spread(live, signal)
     setpoint = device.setpoint_signal.display
-    part = f", {moved / way:.0%} of the way" if way and way == way else ""
+    part = f", {moved / way:.0%} of the way" if way else ""
     locks = [
         each for each in place.file.interlocks if not each.minus and any(each.signal in values for values in seen)
     ]
@@ -408,14 +408,16 @@ def _exercise(
     )
     if problem is not None:
         return [CheckFinding("exercise", f"{text}: {problem}", "see that the output is connected and not blocked")]
-    follows = abs(way) <= near or (not moved * way <= 0.0 and abs(moved) > _SIGNIFICANT * noise)
+    follows = abs(moved) > _SIGNIFICANT * noise
+    if way is not None:
+        follows = abs(way) <= near or (follows and moved * way > 0.0)
     advice = "see that the output is connected, and the sensor on it"
     findings = [
         CheckFinding("exercise", text)
         if follows
         else CheckFinding("exercise", f"{text}, so it does not follow", advice)
     ]
-    if follows and way == way and not is_there():
+    if follows and way and not is_there():
         advice = "compare its scale, calibration and limits with the rig file, or wait longer: it may be slow"
         findings.append(
             CheckFinding("scale", f"{signal} came {moved / way:.0%} of the way in {seconds:.0f} s", advice)

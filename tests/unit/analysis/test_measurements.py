@@ -153,7 +153,7 @@ class TestRuns:
             columns = read_columns(source, ["tec_temperature", "curvature", "finished", "step"])
             np.testing.assert_array_equal(columns.values["curvature"], [0.0, -3.0])
             np.testing.assert_array_equal(columns.values["finished"], [8.0, 16.0])
-            assert columns.units == {"tec_temperature": "°C", "curvature": "1/m", "finished": "s", "step": "1"}
+            assert columns.units == {"tec_temperature": "°C", "curvature": "1/m", "finished": "s", "step": ""}
 
     def test_a_missing_column(self, run):
         path = run((21.0, 0.0))
