@@ -179,7 +179,7 @@ def trial(title: str, endpoints: Path, control: ControlClient) -> dict:
         os.close(note)
         # Whoever opens a T7 next waits for 3 s if it was not released.
         for instrument in ("tec", "psd"):
-            control.power_cycle(instrument)
+            control.fault(f"{instrument}.power-cycle")
     return found
 
 

@@ -165,7 +165,7 @@ def harm_guardian(rig: EmulatedRig, sent: signal.Signals, wait: float) -> dict[s
     return {"": found}
 
 
-def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wait: float) -> dict[str, Found]:
+def cut_line(rig: EmulatedRig, instrument: str, fault: str, wait: float) -> dict[str, Found]:
     """Lose the line of an instrument."""
     file = load_rig(rig.name, {})
     devices = rig.instruments[instrument].devices
@@ -186,7 +186,7 @@ def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wai
     with started(rig, "hold") as run:
         run.await_on(len(SETPOINTS[rig.name]))
         time.sleep(wait)
-        lose(instrument)
+        rig.control.fault(f"{instrument}.{fault}")
         waited = {name for names, _ in parts.values() for name in names}
         seconds, left = watch(rig, waited, max([20.0, *(within + 10.0 for _, within in parts.values())]))
         for title, (names, within) in parts.items():
@@ -210,7 +210,7 @@ def restart(rig: EmulatedRig) -> None:
     """Switch every instrument off and on: a watchdog that has expired keeps its output off until then."""
     for name, instrument in rig.instruments.items():
         if instrument.devices:
-            rig.control.power_cycle(name)
+            rig.control.fault(f"{name}.power-cycle")
 
 
 def trials(rig: EmulatedRig) -> Iterator[tuple[str, Callable[[float], Mapping[str, Found]]]]:
@@ -219,10 +219,10 @@ def trials(rig: EmulatedRig) -> Iterator[tuple[str, Callable[[float], Mapping[st
         yield title, lambda wait, trial=trial: harm_bench(rig, trial, wait)
     for title, sent in GUARDIAN.items():
         yield title, lambda wait, sent=sent: harm_guardian(rig, sent, wait)
-    for title, lose in (("cut", rig.control.cut), ("unplug", rig.control.unplug)):
+    for fault in ("cut", "unplug"):
         for name, instrument in rig.instruments.items():
             if instrument.devices:
-                yield f"{title} {name}", lambda wait, name=name, lose=lose: cut_line(rig, name, lose, wait)
+                yield f"{fault} {name}", lambda wait, name=name, fault=fault: cut_line(rig, name, fault, wait)
 
 
 def main() -> int:

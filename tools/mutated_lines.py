@@ -21,7 +21,7 @@ REQUESTS = (
     {"do": "help"}, {"do": "wait", "until": 3.5}, {"do": "advance", "seconds": 2.0, "rig": "vo2"},
     {"do": "fault", "fault": "tec.delay", "values": {"seconds": 0.5}, "duration": 2.0},
     {"do": "schedule", "faults": [{"fault": "tec.delay", "at": 1.0}]}, {"do": "events", "since": 3},
-    {"do": "operate", "task": "load", "value": 2.0}, {"do": "unplug", "instrument": "tec"},
+    {"do": "operate", "task": "load", "value": 2.0}, {"do": "fault", "fault": "tec.unplug"},
 )  # fmt: skip
 QUESTION = Question("text", title="title")
 

@@ -160,7 +160,7 @@ class ControlClient:
         return float(self.request("wait", until=until, **self._rig)["time"])
 
     def fault(self, name: str, *, duration: float | None = None, **values: float) -> None:
-        """Make a fault happen, for a time (s) or without an end; `values` are what can be chosen of it."""
+        """Make a fault such as `tec.unplug` happen, for a time (s) or without an end; `values` can be chosen."""
         self.request("fault", fault=name, values=values, duration=duration, **self._rig)
 
     def end_fault(self, name: str) -> None:
@@ -180,33 +180,9 @@ class ControlClient:
         """Do by hand what a protocol's prompt asks for."""
         self.request("operate", task=task, value=value, **self._rig)
 
-    def power_cycle(self, instrument: str) -> None:
-        """Switch an instrument off and on again."""
-        self.request("power-cycle", instrument=instrument, **self._rig)
-
-    def unplug(self, instrument: str) -> None:
-        """Pull the cable of an instrument: what is sent either way is lost."""
-        self.request("unplug", instrument=instrument, **self._rig)
-
-    def cut(self, instrument: str) -> None:
-        """Cut the line of an instrument in the middle of its next answer."""
-        self.request("cut", instrument=instrument, **self._rig)
-
-    def hang(self, instrument: str) -> None:
-        """Let an instrument answer nothing until `plug_in`, and late then."""
-        self.request("hang", instrument=instrument, **self._rig)
-
     def plug_in(self, instrument: str) -> None:
         """End all faults of the line of an instrument."""
         self.request("plug-in", instrument=instrument, **self._rig)
-
-    def corrupt(self, instrument: str) -> None:
-        """Damage the next answer of an instrument."""
-        self.request("corrupt", instrument=instrument, **self._rig)
-
-    def drop(self, instrument: str) -> None:
-        """Lose the next answer of an instrument."""
-        self.request("drop", instrument=instrument, **self._rig)
 
     def __enter__(self) -> Self:
         return self

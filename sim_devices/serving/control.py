@@ -189,14 +189,11 @@ class ControlSocket:
                 return {"time": served.clock.now(), "events": events}
             case requests.Operate(task=task, value=value):
                 served.laboratory.operate(task, value)
-            case requests.LineRequest(instrument=instrument):
+            case requests.PlugIn(instrument=instrument):
                 if instrument not in served.laboratory.lines:
                     known = ", ".join(served.laboratory.lines)
                     raise ConfigurationError(f"rig {served.name} has no instrument {instrument!r}; it has: {known}")
-                if isinstance(request, requests.PlugIn):
-                    served.laboratory.mend(instrument)
-                else:
-                    served.laboratory.inject(f"{instrument}.{request.name}")
+                served.laboratory.mend(instrument)
         return {"time": served.clock.now()}
 
     def _time(self, served: ServedLaboratory) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class EmulatedRig:
     instruments : mapping of str to Endpoint
         Address, protocol and devices of each instrument, by its name.
     control : ControlClient
-        The control socket: `state`, `fault`, `power_cycle`, `unplug`, `advance` and more.
+        The control socket: `state`, `fault`, `plug_in`, `advance` and more.
     endpoints_file : Path
         What `bench run --attach` takes.
     """

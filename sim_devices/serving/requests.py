@@ -14,7 +14,6 @@ from bench.rig import ScheduledFault
 
 _LONGEST_SKIP = 3600.0
 _RIG = Field(default=None, description="which rig is meant, where several are served")
-_INSTRUMENT = Field(description="name of an instrument")
 
 
 class Request(BaseModel):
@@ -29,12 +28,6 @@ class RigRequest(Request):
     """Base of what is asked of one rig."""
 
     rig: str | None = _RIG
-
-
-class LineRequest(RigRequest):
-    """Base of what happens to the line of an instrument: a short form of its fault of the same name."""
-
-    instrument: str = _INSTRUMENT
 
 
 class Help(Request):
@@ -107,46 +100,11 @@ class Operate(RigRequest):
     value: float = Field(description="its value, in the unit of the task")
 
 
-class PowerCycle(LineRequest):
-    """Switch an instrument off and on again; connections on TCP are reset."""
-
-    name = "power-cycle"
-
-
-class Unplug(LineRequest):
-    """Pull the cable: what is sent either way is lost, and the instrument keeps working."""
-
-    name = "unplug"
-
-
-class Cut(LineRequest):
-    """Cut the line in the middle of the next answer; TCP connections are reset, and new ones closed at once."""
-
-    name = "cut"
-
-
-class Hang(LineRequest):
-    """Serve nothing; what is asked meanwhile is answered late, when the line is plugged in again."""
-
-    name = "hang"
-
-
-class PlugIn(LineRequest):
+class PlugIn(RigRequest):
     """End all faults of the line of an instrument."""
 
     name = "plug-in"
-
-
-class Corrupt(LineRequest):
-    """Damage the next answer; the instrument has acted all the same."""
-
-    name = "corrupt"
-
-
-class Drop(LineRequest):
-    """Lose the next answer; the instrument has acted all the same."""
-
-    name = "drop"
+    instrument: str = Field(description="name of an instrument")
 
 
 class EndWithConnection(Request):
@@ -164,8 +122,8 @@ class Stop(Request):
 REQUESTS: dict[str, type[Request]] = {
     each.name: each
     for each in (
-        Help, State, Time, Wait, Advance, InjectFault, EndFault, Schedule, Events, Operate, PowerCycle, Unplug, Cut,
-        Hang, PlugIn, Corrupt, Drop, EndWithConnection, Stop,
+        Help, State, Time, Wait, Advance, InjectFault, EndFault, Schedule, Events, Operate, PlugIn, EndWithConnection,
+        Stop,
     )
 }  # fmt: skip
 

@@ -135,7 +135,7 @@ class TestSafe:
         rig = served("hybrid")
         file = tmp_path / "safe.json"
         with client(rig, "tec=0.1", "piezo=20"):
-            rig.control.unplug("t7")
+            rig.control.fault("t7.unplug")
         try:
             code, out, err = bench("safe", *attached(rig), "--json", file, "--limit", "3")
         finally:
@@ -158,7 +158,7 @@ class TestSafe:
     def test_it_goes_on_until_every_device_is_confirmed(self, served):
         rig = served("hybrid")
         with client(rig, "tec=0.1", "piezo=20"):
-            rig.control.unplug("t7")
+            rig.control.fault("t7.unplug")
         with rescuing(rig) as process:
             lines = iter(process.stderr.readline, "")
             assert sum("s: piezo; trying again" in next(lines) for _ in range(4)) >= 3
@@ -270,7 +270,7 @@ class TestRecover:
 
     def test_what_cannot_be_reached_is_no_error_to_clear(self, bench, served):
         rig = served("vo2")
-        rig.control.unplug("tec")
+        rig.control.fault("tec.unplug")
         try:
             code, out, err = bench("rig", "clear", *attached(rig), "--yes")
         finally:
@@ -424,7 +424,7 @@ class TestDoctor:
     @pytest.mark.slow
     def test_a_device_that_is_gone_keeps_no_other_from_being_checked(self, bench, served, tmp_path):
         rig = served("vo2")
-        rig.control.unplug("tec")
+        rig.control.fault("tec.unplug")
         try:
             code, findings = self.findings(bench, tmp_path, *attached(rig))
         finally:

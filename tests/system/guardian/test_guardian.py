@@ -39,8 +39,8 @@ def station(vo2):
     with contextlib.ExitStack() as stack:
         # The watchdog of the TEC would have to be cleared by hand, and whoever opens a T7 next waits for 3 s if it
         # was not released.
-        stack.callback(vo2.control.power_cycle, "psd")
-        stack.callback(vo2.control.power_cycle, "tec")
+        stack.callback(vo2.control.fault, "psd.power-cycle")
+        stack.callback(vo2.control.fault, "tec.power-cycle")
 
         def make(file=None, **overrides):
             made = stack.enter_context(connected(vo2, file, **overrides))
@@ -111,7 +111,7 @@ class TestRequests:
         assert remote.end() == SAFE
 
     def test_a_rig_that_cannot_be_connected_is_refused_in_the_words_of_its_driver(self, vo2):
-        vo2.control.unplug("tec")
+        vo2.control.fault("tec.unplug")
         try:
             with pytest.raises(DeviceConnectionError, match="tec: no answer"), connected(vo2):
                 pass
@@ -194,7 +194,7 @@ class TestBenchGone:
             bench.stdout.close()
             if child is not None:
                 os.kill(child, signal.SIGKILL)
-            vo2.control.power_cycle("tec")
+            vo2.control.fault("tec.power-cycle")
 
 
 class TestPromises:
@@ -256,7 +256,7 @@ class TestInterlocks:
 
     def test_a_blind_interlock_is_the_safe_state_of_what_can_be_reached(self, station, vo2):
         it = station(safety__reconnect="0.5")
-        vo2.control.unplug("tec")
+        vo2.control.fault("tec.unplug")
         seconds_until(lambda: it._process.poll() is None and not is_on(vo2))
         # What comes first: the line counts as lost, or the TEC was not seen for too long.
         with pytest.raises(DeviceError, match=r"^tec: (no answer|could not be looked at)"):
@@ -274,7 +274,7 @@ class TestInterlocks:
 class TestReconnection:
     def test_one_that_falls_silent_at_the_end_leaves_time_to_those_after_it(self, station, vo2):
         made = station(safety__order='["tec", "psd"]', devices__tec__timeout="2.0")
-        vo2.control.hang("tec")
+        vo2.control.fault("tec.hang")
         # A look at the interlocks waits for its answer then.
         vo2.control.wait(vo2.control.time() + 0.5)
         states = made.end()
@@ -286,7 +286,7 @@ class TestReconnection:
         # It is lost after three requests of 0.2 s, and may be away for 2 s more. A guardian on a busy machine waits
         # longer for an answer, and a line that is back by then was not lost.
         for seconds in (1.0, 1.5, 2.0, 2.5, 2.5, 2.5):
-            vo2.control.unplug("tec")
+            vo2.control.fault("tec.unplug")
             back = threading.Timer(seconds, vo2.control.plug_in, ["tec"])
             back.start()
             values = it.look(Look.GLANCE)
@@ -300,7 +300,7 @@ class TestReconnection:
 
     def test_an_abandoned_request_is_not_taken_for_the_answer_to_the_end(self, station, vo2):
         it = station()
-        vo2.control.hang("psd")
+        vo2.control.fault("psd.hang")
         it.clock.interrupted = lambda: True
         try:
             with pytest.raises(AbortError, match="had not answered"):
@@ -374,7 +374,7 @@ class TestGuardianGone:
             bench.kill()
             bench.wait()
             bench.stdout.close()
-            vo2.control.power_cycle("tec")
+            vo2.control.fault("tec.power-cycle")
 
     def test_without_a_rescuer(self, station, vo2):
         it = station()
@@ -397,5 +397,5 @@ class TestGuardianGone:
         it = station(safety__reconnect="0.5")
         seconds_until(it._report.is_ready)
         guardian_of(it).kill()
-        vo2.control.unplug("tec")
+        vo2.control.fault("tec.unplug")
         assert "safe" not in it.end()["tec"].split()

@@ -70,7 +70,7 @@ def started(vo2, listener):
 
     yield start
     for instrument in vo2.instruments:
-        vo2.control.power_cycle(instrument)
+        vo2.control.fault(f"{instrument}.power-cycle")
 
 
 ENDINGS = {
@@ -203,7 +203,7 @@ def test_a_device_that_cannot_be_reached_is_not_called_safe(vo2, listener, tmp_p
             station.keep_record(tmp_path, [command], {"rig": "vo2", "protocol": "none"})
             station.promise(LONG, "a test")
             station.apply({"tec": 40.0})
-            vo2.control.unplug("tec")
+            vo2.control.fault("tec.unplug")
             station._channel.close()
             seconds_until(told)
             assert ending_of(tmp_path).safe_state["tec"] != "safe"
@@ -213,6 +213,6 @@ def test_a_device_that_cannot_be_reached_is_not_called_safe(vo2, listener, tmp_p
             assert ending_of(tmp_path).safe_state == SAFE
     finally:
         vo2.control.plug_in("tec")
-        vo2.control.power_cycle("tec")
+        vo2.control.fault("tec.power-cycle")
     (facts,) = told()
     assert re.search(r"; tec: NOT CONFIRMED SAFE, .*, psd: safe$", facts["text"])

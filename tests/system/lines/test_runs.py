@@ -136,7 +136,7 @@ class TestServed:
     def station(self, served, buses):
         # A TEC that lost its host keeps an error until it is reset.
         for name in ("tec1", "tec2"):
-            served.control.power_cycle(name)
+            served.control.fault(f"{name}.power-cycle")
         keys = {f"devices__servo{number}__watchdog": "0" for number in (1, 2, 3)}
         with guarded(served, buses, safety__reconnect="60", **keys) as station:
             station.promise(60.0, "a test")
@@ -159,7 +159,7 @@ class TestServed:
         wanted = {"servo1_position": 3.3, "servo2_position": 3.5, "servo3_position": 2.7, "load2_force": -20.0}
         wanted |= {"tec1_current": 0.2, "tec2_current": -0.3}
         check(station.look(Look.GLANCE), wanted)
-        served.control.unplug("servo3")
+        served.control.fault("servo3.unplug")
         seen = "servo1_position", "servo2_position", "tec1_current"
         check(station.look(Look.PART, seen), {key: wanted[key] for key in seen})
         # Longer than an interlock may be blind: the guardian sees its neighbours all the time.
@@ -169,7 +169,7 @@ class TestServed:
         check(station.look(Look.GLANCE), wanted)
         texts = [each.text for each in station.news() if each.kind == "line"]
         assert [text.partition(":")[0] for text in texts] == ["servo3"]
-        served.control.power_cycle("tec2")
+        served.control.fault("tec2.power-cycle")
         with pytest.raises(DeviceRestartedError, match=r"^tec2: "):
             look_on(station, Look.GLANCE)
         assert set(station.end().values()) == {"safe"}
@@ -181,7 +181,7 @@ class TestServed:
 
     def test_an_interlock_acts_in_time_beside_a_neighbour_that_is_silent(self, served, station):
         station.apply({"tec1": 0.2, "tec2": -0.3})
-        served.control.unplug("load1")
+        served.control.fault("load1.unplug")
         # The guardian has found that it is silent.
         station.clock.sleep(0.5)
         served.control.operate("load2", 45.0)
@@ -196,7 +196,7 @@ class TestServed:
 
     def test_a_device_that_stays_away_ends_the_run_by_its_name(self, served, station):
         station.apply({"tec1": 0.2, "tec2": -0.3})
-        served.control.unplug("load2")
+        served.control.fault("load2.unplug")
         with pytest.raises(DeviceError, match=r"^load2: "):
             look_on(station, Look.PART, ["load1_force"])
         assert set(station.end().values()) == {"safe"}

@@ -89,7 +89,7 @@ def test_network_management_and_the_boot_up_after_a_restart(connect, sma):
         assert watch.seconds() < PATIENCE
     boots = []
     network.subscribe(0x700 + NODE, lambda _, data, __: boots.append(data[0]))
-    sma.control.power_cycle("supply")
+    sma.control.fault("supply.power-cycle")
     while 0 not in boots:
         assert watch.seconds() < PATIENCE
         WallClock().sleep(0.01)

@@ -123,7 +123,7 @@ def test_an_unplugged_line_is_silent_and_comes_back(line):
     request, _ = line.dialect.probe(line.rng)
     with line.open() as port:
         line.expect_answer(port)
-        line.rig.control.unplug(line.instrument)
+        line.rig.control.fault(f"{line.instrument}.unplug")
         port.reset_input_buffer()
         port.write(request)
         assert port.read(1) == b""

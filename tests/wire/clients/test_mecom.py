@@ -109,7 +109,7 @@ def test_any_device_answers_to_address_0(connect):
 
 def test_a_lost_answer_is_asked_for_again(tec, vo2):
     tec.line.timeout = 2.0
-    vo2.control.drop("tec")
+    vo2.control.fault("tec.drop")
     assert tec.integer(100) == 1091
-    vo2.control.corrupt("tec")
+    vo2.control.fault("tec.corrupt")
     assert tec.integer(100) == 1091

@@ -77,7 +77,7 @@ def test_time_is_advanced_on_a_scaled_clock_and_passes_by_itself(vo2):
 
 def test_a_cut_resets_connections_and_turns_new_ones_away(vo2, connect):
     connection = connect(vo2.port("psd"))
-    vo2.control.cut("psd")
+    vo2.control.fault("psd.cut")
     connection.sendall(bytes.fromhex("000100000006 01 03 ea60 0002"))
     received = b""
     try:
@@ -132,7 +132,7 @@ def test_a_cut_line_on_raw_tcp_is_reset_and_taken_again_when_it_is_back(emulate,
     with emulate("vo2", "--tcp") as (_, endpoints), ControlClient(endpoints["control"]) as control:
         address = endpoints["instruments"]["tec"]["port"]
         connection = connect(address)
-        control.cut("tec")
+        control.fault("tec.cut")
         connection.sendall(IDENTIFY)
         with suppress(ConnectionError):
             while connection.recv(100):
@@ -149,7 +149,7 @@ def test_a_restarted_supply_says_so(sma, opened):
     line = opened(sma.port("supply"))
     line.write(b"\rC\rS4\rO\r")
     assert line.read_until(b"t701105\r").endswith(b"t701105\r")
-    sma.control.power_cycle("supply")
+    sma.control.fault("supply.power-cycle")
     assert line.read_until(b"t701100\r").endswith(b"t701100\r")
     line.write(b"C\r")
 
@@ -184,8 +184,7 @@ def test_a_wrong_request_is_one_message(line, words):
     [
         ({"do": "fault", "fault": "flood"}, "no fault 'flood'; it has: tec-over-current,"),
         ({"do": "fault", "fault": "displaced-spot", "values": {"volts": 1}}, "no value 'volts'; it takes: metres"),
-        ({"do": "unplug", "instrument": "x"}, "rig vo2 has no instrument 'x'; it has: psd, tec"),
-        ({"do": "power-cycle", "instrument": "x"}, "rig vo2 has no instrument 'x'; it has: psd, tec"),
+        ({"do": "plug-in", "instrument": "x"}, "rig vo2 has no instrument 'x'; it has: psd, tec"),
         ({"do": "operate", "task": "load", "value": 1}, "cannot carry out 'load'"),
         ({"do": "state", "rig": "sma"}, "rig 'sma' is not served; there are: vo2"),
     ],
