@@ -27,15 +27,12 @@ class Workplace:
     entries : tuple of DeviceEntry
         Its devices in the order of the file, wired to their true ports.
     clock : Clock
-        The clock of the rig, for one thread.
-    make_clock : callable
-        Returns such a clock for a further thread, until the workplace is left.
+        The clock of the rig, for any thread.
     """
 
     file: RigFile
     entries: tuple[DeviceEntry, ...]
     clock: Clock
-    make_clock: Callable[[], Clock]
     _locks: Locks
 
     @property
@@ -93,21 +90,11 @@ def opened(
         if endpoints is not None:
             if not file.emulated:
                 raise ConfigurationError(f"rig {file.name} has no emulated laboratory that could be served elsewhere")
-
-            def clock_of_server() -> Clock:
-                attachment = attach(endpoints, file.name)
-                stack.callback(attachment.close)
-                return attachment.clock
-
             attachment = attach(endpoints, file.name)
             stack.callback(attachment.close)
-            ports, clock, further = attachment.open(), attachment.clock, clock_of_server
+            ports, clock = attachment.open(), attachment.clock
         else:
             clock = make_clock("virtual" if file.in_process else "wall", in_process=file.in_process)
-
-            def further() -> Clock:
-                return clock
-
             if file.laboratory is not None:
                 laboratory = file.laboratory(file.laboratory_settings, clock, 0)
                 ports = laboratory.open()
@@ -120,4 +107,4 @@ def opened(
             if report_use is None:
                 raise
             report_use(str(error))
-        yield Workplace(file, entries, clock, further, locks)
+        yield Workplace(file, entries, clock, locks)

@@ -106,7 +106,7 @@ class _Tries:
         for entries in place.lines.values():
             ordered = sorted(entries, key=lambda entry: not issubclass(entry.driver, Actuator))
             # A line that hangs must not keep the process from its end.
-            thread = threading.Thread(target=self._work, args=(ordered, place.make_clock()), daemon=True)
+            thread = threading.Thread(target=self._work, args=(ordered, place.clock), daemon=True)
             self._threads.append(thread)
         for thread in self._threads:
             thread.start()
