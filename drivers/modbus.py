@@ -176,15 +176,13 @@ class TcpClient(_PortClient):
     Parameters
     ----------
     port : serial.SerialBase
-        The open port, with an `exchange` of its own.
+        The open port.
     unit : int
         Unit identifier, 0 to 255.
     """
 
     def __init__(self, port: Any, unit: int = 1) -> None:  # noqa: ANN401 - pyserial is untyped
         super().__init__(port)
-        # Sends bytes, and returns what has come already, as it has in process.
-        self._exchange = port.exchange
         self._unit = unit
         self._transaction = 0
 
@@ -192,7 +190,9 @@ class TcpClient(_PortClient):
         """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
         transaction = self._transaction = (self._transaction + 1) & _LAST_TRANSACTION
         unit = self._unit
-        reply: bytes = self._exchange(_pack_header(transaction, 0, len(request) + 1, unit) + request)
+        self._port.write(_pack_header(transaction, 0, len(request) + 1, unit) + request)
+        # In process the reply has come already.
+        reply: bytes = self._port.read_all()
         size = _HEADER_SIZE + expected
         if len(reply) == size and reply.startswith(_pack_reply_head(transaction, 0, expected + 1, unit, request[0])):
             return reply[_HEADER_SIZE:]
@@ -277,7 +277,7 @@ class RtuClient(_PortClient):
     Parameters
     ----------
     port : serial.SerialBase
-        The open port, with an `ask` of its own.
+        The open port.
     unit : int
         Address of the instrument, 1 to 247.
     """
@@ -291,7 +291,9 @@ class RtuClient(_PortClient):
 
         Raises `NoReplyError` or `UnexpectedReplyError`, besides what the base class says.
         """
-        reply: bytes = self._port.ask(_framed(self._unit, request))
+        self._port.reset_input_buffer()
+        self._port.write(_framed(self._unit, request))
+        reply: bytes = self._port.read_all()
         if len(reply) != expected + 3 or reply[0] != self._unit or reply[1] != request[0]:
             reply = self._reply_among(reply, request, expected)
             if reply[1] == request[0] | _REFUSED:

@@ -357,16 +357,6 @@ class LinePort(Share):
             received: bytes = self._port.read_all()
             return self._awaited(received) if received else b""
 
-    def exchange(self, data: bytes) -> bytes:
-        """Send a message; return what has come already."""
-        self.write(data)
-        return self.read_all()
-
-    def ask(self, data: bytes) -> bytes:
-        """Forget what was received, send a message, and return what has come already."""
-        self.reset_input_buffer()
-        return self.exchange(data)
-
     def reset_input_buffer(self) -> None:
         """Forget what was received and not read."""
         with self._in_turn():

@@ -242,42 +242,6 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
         return answer
 
-    def exchange(self, data: bytes) -> bytes:
-        """Send bytes and return what was received then; as `write` and `read_all` do, but sooner."""
-        if not self.is_open or not self._socket.taken:
-            self._check()
-        received, connection = self._received, self._connection
-        if connection is not None:
-            if not received:
-                try:
-                    return connection.receive(data)
-                except (FramingError, ConnectionError) as error:
-                    raise self._ended(error) from None
-            self.write(data)
-            return self.read_all()
-        answer = self._answer(data)
-        # What comes while the answer passes comes behind it.
-        answer += self._stream.unsolicited()
-        if received:
-            answer = bytes(received) + answer
-            received.clear()
-        return answer
-
-    def ask(self, data: bytes) -> bytes:
-        """Forget what was received and not read, send bytes on a serial line, and return what was received then."""
-        if not self.is_open or not self._socket.taken:
-            self._check()
-        received, stream = self._received, self._stream
-        # What comes while the bytes pass is received after all.
-        stream.unsolicited()
-        received.clear()
-        answer = self._answer(data)
-        answer += stream.unsolicited()
-        if received:
-            answer = bytes(received) + answer
-            received.clear()
-        return answer
-
     def _ended(self, error: Exception) -> SerialException:
         return SerialException(f"{EMULATED}{self._name} ended the connection: {error}")
 

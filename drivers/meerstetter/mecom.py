@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from binascii import crc_hqx
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from typing import ClassVar, NamedTuple
@@ -96,8 +96,6 @@ class TECLine(RepeatingLine):
         self._strange = b""
         self._silence = f"no answer within {settings.timeout:g} s"
         self.port = open_port(device, settings)
-        # An emulated line hands the answer over with the request.
-        self._swap: Callable[[bytes], bytes] = getattr(self.port, "exchange", self._write_and_look)
 
     def close(self) -> None:
         """Release the line."""
@@ -151,7 +149,9 @@ class TECLine(RepeatingLine):
             for attempt in range(1 + resends):
                 if attempt:
                     self.repeats += 1
-                answer = self._swap(frame)
+                self.port.write(frame)
+                # An emulated line has the answer already.
+                answer: bytes = self.port.read_all()
                 if len(answer) == _ACKNOWLEDGE_LENGTH + digits and answer.startswith(head) and not self._received:
                     # A good answer that is all there is, as it mostly is on an emulated line.
                     if not digits:
@@ -174,12 +174,6 @@ class TECLine(RepeatingLine):
         self.resends = 0
         found, address = other_answer(self._strange), self._settings.address
         raise no_answer(self._device, self._settings, problem, "address", address, found, resends=resends)
-
-    def _write_and_look(self, frame: bytes) -> bytes:
-        """Send a frame; return what has come already."""
-        self.port.write(frame)
-        come: bytes = self.port.read_all()
-        return come
 
     def _answer(self, head: bytes, crc: bytes, digits: int) -> tuple[str, bytes]:
         """Return what is wrong with the answer, if anything, and its payload."""
