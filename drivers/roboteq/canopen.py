@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 else:
     slcan = DeferredModule("drivers.roboteq.slcan")
 
-_MOST_DOWNLOADS = 64  # that are kept; a voltage that is held is commanded again and again
+_MOST_KNOWN = 128  # requests that are kept; a voltage that is held is commanded again and again
 _MOST_FRAMES = 4096  # looked at for one answer; a full buffer of the system has some 500
 _LONGEST_TEXT = 256
 _LATEST = 3.0  # time-outs after its request until which an answer may come
@@ -152,8 +152,6 @@ class NodeLine(RepeatingLine):
         self._request_head = b"t%03X8" % (_SDO_REQUEST + settings.node)
         answer_head = b"t%03X8" % (_SDO_ANSWER + settings.node)
         self._answer_heads = frozenset((answer_head, answer_head.lower()))
-        self._queries: dict[tuple[int, int], tuple[bytes, bytes]] = {}
-        self._downloads: dict[tuple[int, int, int], tuple[bytes, bytes]] = {}
         self._heard: set[int] = set()
         self._quiet_at = -math.inf
         self.round_trip = 0.0
@@ -185,11 +183,8 @@ class NodeLine(RepeatingLine):
 
     def read(self, item: Entry, sub: int) -> int:
         """Read a number; errors are `AbortedError` and `DeviceConnectionError`."""
-        query = self._queries.get((item.index, sub))
-        if query is None:
-            multiplexer = struct.pack("<HB", item.index, sub)
-            query = self._queries[item.index, sub] = self._request(b"\x40" + multiplexer), multiplexer
-        answer = self._exchange(*query)
+        multiplexer = struct.pack("<HB", item.index, sub)
+        answer = self._exchange(self._request(b"\x40" + multiplexer), multiplexer)
         command = answer[0]
         # The maker's own examples leave the bits e and s clear and still say the size.
         if command >> 5 != 2 or command & 3 == 1:
@@ -293,15 +288,9 @@ class NodeLine(RepeatingLine):
 
     def _download(self, item: Entry, value: int, sub: int) -> tuple[bytes, bytes]:
         """Return the line of a request that writes a number, and the object that its answer names."""
-        known = self._downloads.get((item.index, sub, value))
-        if known is None:
-            multiplexer = struct.pack("<HB", item.index, sub)
-            data = value.to_bytes(item.size, "little", signed=item.signed)
-            known = self._request(bytes((0x23 | (4 - item.size) << 2,)) + multiplexer + data), multiplexer
-            if len(self._downloads) >= _MOST_DOWNLOADS:
-                self._downloads.clear()
-            self._downloads[item.index, sub, value] = known
-        return known
+        multiplexer = struct.pack("<HB", item.index, sub)
+        data = value.to_bytes(item.size, "little", signed=item.signed)
+        return self._request(bytes((0x23 | (4 - item.size) << 2,)) + multiplexer + data), multiplexer
 
     def _read_segments(self, item: Entry, multiplexer: bytes) -> bytes:
         text, toggle, last = b"", 0, False
@@ -322,7 +311,7 @@ class NodeLine(RepeatingLine):
 
     def _request(self, payload: bytes) -> bytes:
         """Return the line of a request."""
-        return b"%s%s\r" % (self._request_head, payload.ljust(8, b"\0").hex().upper().encode("ascii"))
+        return _line_of(self._request_head, payload)
 
     def _exchange(self, request: bytes, multiplexer: bytes = b"", before: float = math.inf) -> bytes:
         """Send the line of a request; return the eight bytes of its answer."""
@@ -411,6 +400,12 @@ class NodeLine(RepeatingLine):
         found += other_answer(strange)
         problem, speed = f"no answer within {settings.timeout:g} s", f"{settings.bitrate} bit/s"
         return no_answer(self._device, settings, problem, "node", settings.node, found, speed, resends)
+
+
+@lru_cache(_MOST_KNOWN)
+def _line_of(head: bytes, payload: bytes) -> bytes:
+    """Return the line of a frame of eight bytes."""
+    return b"%s%s\r" % (head, payload.ljust(8, b"\0").hex().upper().encode("ascii"))
 
 
 @lru_cache(maxsize=16)
