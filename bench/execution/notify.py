@@ -150,8 +150,6 @@ class Notifier:
     ----------
     targets : sequence of str
         Commands, `mailto:` and `https://` addresses.
-    signals : sequence of str
-        Names of the signals, in the order of the engine's values.
 
     Raises
     ------
@@ -159,10 +157,11 @@ class Notifier:
         If a target is none.
     """
 
-    def __init__(self, targets: Sequence[str], signals: Sequence[str] = ()) -> None:
+    def __init__(self, targets: Sequence[str]) -> None:
         self._notices: list[str] = []
         self._lines = [_Line(target, self._notices) for target in targets]
-        self.signals = tuple(signals)
+        self.signals: tuple[str, ...] = ()
+        """Names of the signals, in the order of the engine's values."""
         self.facts: dict[str, Any] = {}
         """What is said of the run in each message: run, rig, protocol, …"""
         self.is_told: Callable[[], bool] = lambda: False

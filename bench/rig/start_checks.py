@@ -101,9 +101,7 @@ def shortened_absences(rig: RigDescription, *, guarded: bool) -> tuple[str, ...]
     )
 
 
-def check_start(
-    rig: RigDescription, *, interval: float, interval_key: str, measurements: Mapping[str, float] | None = None
-) -> tuple[str, ...]:
+def check_start(rig: RigDescription, *, interval: float, interval_key: str) -> tuple[str, ...]:
     """Check that a rig can be left to itself.
 
     Parameters
@@ -115,8 +113,6 @@ def check_start(
         the interlocks, where these feed the watchdogs.
     interval_key : str
         Key of the rig file from which the interval comes, for messages.
-    measurements : mapping of str to float, optional
-        Longest time of one measurement by name of device, s, where it is known.
 
     Returns
     -------
@@ -130,7 +126,7 @@ def check_start(
         interlock, or an interlock does not fit its signals; one line each.
     """
     file = rig.file
-    wrong = [*_wrong_intervals(rig, interval, interval_key, measurements or {})]
+    wrong = [*_wrong_intervals(rig, interval, interval_key)]
     for i, interlock in enumerate(file.interlocks):
         wrong.extend(f"interlocks.{i}.{problem}" for problem in _wrong_interlock(interlock, rig))
     unguarded = [*_unguarded(rig)]
@@ -164,24 +160,19 @@ def calibration_warnings(file: RigFile, today: date) -> tuple[str, ...]:
     return tuple(f"{file.path}: {warning}" for warning in warnings)
 
 
-def _wrong_intervals(
-    rig: RigDescription, interval: float, interval_key: str, measurements: Mapping[str, float]
-) -> Iterable[str]:
+def _wrong_intervals(rig: RigDescription, interval: float, interval_key: str) -> Iterable[str]:
     guarded = [(device.watchdog, device.name) for device in rig.devices.values() if device.watchdog]
     if not guarded:
         return
     watchdog, name = min(guarded)
     allowed = SHARE_OF_WATCHDOG * watchdog
-    why = (
-        f"{name} goes to its safe state after {watchdog:g} s of silence; {allowed:g} s, {SHARE_OF_WATCHDOG:g} of its "
-        "watchdog, is allowed at most"
-    )
     # Products of rounded numbers: 0.4 * 5 s are 2 s.
     if interval > allowed * (1.0 + 1e-9):
-        yield f"{interval_key}: instruments are asked each {interval:g} s only, but {why}"
-    for device, longest in measurements.items():
-        if longest > allowed * (1.0 + 1e-9):
-            yield f"devices.{device}: a measurement takes {longest:.3g} s, but {why}"
+        yield (
+            f"{interval_key}: instruments are asked each {interval:g} s only, but {name} goes to its safe state "
+            f"after {watchdog:g} s of silence; {allowed:g} s, {SHARE_OF_WATCHDOG:g} of its watchdog, is allowed at "
+            "most"
+        )
 
 
 def _wrong_interlock(interlock: Interlock, rig: RigDescription) -> Iterable[str]:

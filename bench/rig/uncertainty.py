@@ -498,7 +498,7 @@ class UncertainSignals:
         number = self._reading(signal, values, parts, missing, noise, calibrated=False)
         return UncertainReading(signal, self._units[signal], number, tuple(parts), tuple(dict.fromkeys(missing)))
 
-    def at(self, signal: str, value: float, *, noise: bool = True) -> UncertainReading:
+    def at(self, signal: str, value: float) -> UncertainReading:
         """Return a reading of a signal that has a value, whatever the readings behind it are.
 
         Raises ConfigurationError if it is computed from several signals, or never has the value.
@@ -518,7 +518,7 @@ class UncertainSignals:
             except (ArithmeticError, RuntimeError, DeviceError) as error:
                 raise ConfigurationError(f"{name} cannot be {wanted:.6g} {self._units[name]}: {error}") from None
             name = source
-        return self.reading(signal, values, noise=noise)
+        return self.reading(signal, values)
 
     def _reading(
         self,

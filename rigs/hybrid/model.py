@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.identification import Identification, Initial, ThirdOrder, identify
+from bench.identification import Identification, ThirdOrder, identify
 from bench.models import Model, ModelSpec, Operator, Parts, Polynomial, PrandtlIshlinskii
 from rigs.hybrid.network import NODES, ThermalNetwork
 
@@ -234,12 +234,12 @@ def identify_pi(
     *,
     plays: int = 15,
     maximum: float | None = None,
-    initial: Initial | None = None,
 ) -> Identification[PrandtlIshlinskii]:
     """Return the Prandtl-Ishlinskii operator that fits the quasi-static piezo deflection best.
 
     Plays with thresholds i maximum / plays, weights not negative, and a free offset (Rakotondrabe and Ivan 2010,
-    eq. 20, with a state in volts for each play). The first weight is positive, so that the operator has its inverse.
+    eq. 20, with a state in volts for each play, relaxed before the first sample). The first weight is positive, so
+    that the operator has its inverse.
 
     Parameters
     ----------
@@ -251,8 +251,6 @@ def identify_pi(
         Number of plays.
     maximum : float or None
         Greatest voltage of the operating range, V; default the greatest among the samples.
-    initial : {"negative", "positive", "skip"} or None
-        Memory before the first sample, as in `identify`; None is relaxed.
 
     Raises
     ------
@@ -274,7 +272,7 @@ def identify_pi(
         input_range=(-limit, limit),
         input_unit="V",
         output_unit="m",
-        initial=initial,
+        initial=None,
     )
     if not found.model.coefficients[0] > 0.0:
         raise ValueError("deflections: expected a positive weight of the first play; there is no inverse without it")

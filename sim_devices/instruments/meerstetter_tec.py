@@ -284,18 +284,10 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._shut_down()
             self._restart()
 
-    def trip(self, error_number: int, *, parameter: int = 0) -> None:
-        """Put the device into its error state.
-
-        Parameters
-        ----------
-        error_number : int
-            As parameter 105 will report it, such as 138.
-        parameter : int
-            The parameter that parameter 107 will name.
-        """
+    def trip(self, error_number: int) -> None:
+        """Put the device into its error state; parameter 105 reports the number, such as 138."""
         with self.world.at_present():
-            self._trip(error_number, parameter)
+            self._trip(error_number)
 
     # Timed events.
 

@@ -304,11 +304,9 @@ def _torture(bed: Bed, name: str, seed: int, reference: Reference) -> Cell:
     return Cell(", ".join(bed.devices_at(name)), name, seed, status, reason, results)
 
 
-def cells(
-    task: Task, faults: list[str], seeds: int, processes: int | None, console: Console, kernels: tuple[str, ...] = ()
-) -> Iterator[Cell]:
+def cells(task: Task, faults: list[str], seeds: int, processes: int | None, console: Console) -> Iterator[Cell]:
     """Yield each run as it is judged, in the order of faults and seeds; one that hangs is one of its failures."""
-    with Workers(processes, console, f"torture {task.rig}", kernels=kernels) as workers:
+    with Workers(processes, console, f"torture {task.rig}") as workers:
         waiting = [
             workers.submit_as(f"no fault {seed}", reference_of, task, seed) for seed in range(max(seeds, _REFERENCES))
         ]

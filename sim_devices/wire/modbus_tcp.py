@@ -24,6 +24,9 @@ from sim_devices.wire.modbus import FEEDBACK, Feedback, Packet, RegisterBank, an
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
 _KEY_END = _HEADER.size + 6  # function 16 has that many bytes before its values
+_CONNECTIONS = 2
+"""Connections that an instrument accepts. Source: T-series datasheet, 6.0 Ethernet, of a T7 on port 502. That it
+refuses one more, and does not end the oldest instead, is an assumption."""
 _MOST_BYTES = 1034  # unit identifier and the longest PDU of a T7, whose packets have up to 1040 bytes
 
 
@@ -51,17 +54,13 @@ class ModbusTcpInstrument(TcpServer):
     ----------
     bank : RegisterBank
         The instrument.
-    connections : int
-        How many connections it accepts: a T7 two on port 502 (T-series datasheet, 6.0 Ethernet). That it refuses one
-        more, and does not end the oldest instead, is an assumption.
     """
 
     protocol = "Modbus TCP"
     has_addresses = True
 
-    def __init__(self, bank: RegisterBank, *, connections: int = 2) -> None:
+    def __init__(self, bank: RegisterBank) -> None:
         self.bank = bank
-        self._most = connections
         self._open: list[ModbusTcpStream] = []
         if isinstance(bank, Restartable):
             bank.on_restart(self.end_connections)
@@ -71,8 +70,8 @@ class ModbusTcpInstrument(TcpServer):
 
         Raises `ConnectionRefusedError` if as many as the instrument accepts are open.
         """
-        if len(self._open) >= self._most:
-            raise ConnectionRefusedError(f"connection refused: the instrument has {self._most} open already")
+        if len(self._open) >= _CONNECTIONS:
+            raise ConnectionRefusedError(f"connection refused: the instrument has {_CONNECTIONS} open already")
         stream = ModbusTcpStream(self.bank, self._open.remove)
         self._open.append(stream)
         return stream

@@ -158,7 +158,8 @@ class TestSecrets:
 class TestNotifier:
     def test_what_is_told_and_what_is_not(self, listener):
         command, told = listener
-        with Notifier([command], ["tec_temperature"]) as notifier:
+        with Notifier([command]) as notifier:
+            notifier.signals = ("tec_temperature",)
             notifier.facts = {"rig": "heater"}
             notifier.telemetry(1.0, 0, (40.0,))
             for level, kind in (

@@ -77,9 +77,9 @@ def describe(tmp_path):
 
 @pytest.fixture
 def check(describe):
-    def check(*interlocks, interval=0.2, key="safety.rate", measurements=None, **keys):
+    def check(*interlocks, interval=0.2, key="safety.rate", **keys):
         description = describe(*interlocks, **keys)
-        return check_start(description, interval=interval, interval_key=key, measurements=measurements)
+        return check_start(description, interval=interval, interval_key=key)
 
     return check
 
@@ -113,11 +113,6 @@ class TestIntervals:
         for watchdog in (0.1, 0.7, 1.1, 2.3, 5.0):
             assert check(HOT, devices=[replace(TEC, watchdog=watchdog)], interval=0.4 * watchdog) == ()
             assert check(HOT, devices=[replace(TEC, watchdog=watchdog)], interval=2.0 * watchdog / 5.0) == ()
-
-    def test_of_the_longest_measurement_of_any_device(self, check):
-        assert check(HOT, measurements={"psd": 0.8}) == ()
-        (line,) = refused(check, HOT, measurements={"psd": 0.1, "tec": 0.9})
-        assert line.startswith("devices.tec: a measurement takes 0.9 s, but psd goes to its safe state after 2 s")
 
     @pytest.mark.parametrize("watchdog", [None, 0.0])
     def test_without_a_watchdog_there_is_no_bound(self, check, watchdog):
