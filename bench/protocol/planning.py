@@ -12,7 +12,7 @@ from typing import NoReturn, cast
 from bench.base import BenchError, ConfigurationError
 from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
 from bench.protocol.vocabulary import Control, FixedRate, Message, Messages, Reading, Step
-from bench.rig import Slots
+from bench.rig import SETPOINT, Slots
 
 LONGEST = 1_000_000
 """Most steps of a protocol, and most notes."""
@@ -170,12 +170,12 @@ class _KnownValues(Mapping[str, float]):
     def take(self, message: Message) -> None:
         """Note what a message sends; where a controller leaves its actuators is not known."""
         if isinstance(message, Step):
-            self._setpoints |= {f"{device}_setpoint": value for device, value in message.setpoints.items()}
+            self._setpoints |= {f"{device}{SETPOINT}": value for device, value in message.setpoints.items()}
         elif isinstance(message, Control):
-            self._setpoints.pop(f"{message.actuator}_setpoint", None)
+            self._setpoints.pop(f"{message.actuator}{SETPOINT}", None)
         elif isinstance(message, FixedRate):
             for device in message.actuators:
-                self._setpoints.pop(f"{device}_setpoint", None)
+                self._setpoints.pop(f"{device}{SETPOINT}", None)
 
     def decide(self) -> _UnknownError:
         """Note that something unknown is to decide how the protocol goes on; return what to raise."""

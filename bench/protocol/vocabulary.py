@@ -39,7 +39,7 @@ from bench.devices import (
     durations,
 )
 from bench.operator import Desk
-from bench.rig import Slot as Slot, Slots as Slots
+from bench.rig import SETPOINT, Slot as Slot, Slots as Slots
 
 
 class Message(ABC):
@@ -249,7 +249,7 @@ class FixedRate(Message):
 
     def plan(self) -> Planned:
         """Return the limits of its set-points and its duration."""
-        setpoints = (f"{name}_setpoint" for name in self.actuators)
+        setpoints = (f"{name}{SETPOINT}" for name in self.actuators)
         return Planned(
             seconds=self.duration,
             at_most=self.duration + self.put_off,

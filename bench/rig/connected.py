@@ -37,6 +37,7 @@ from bench.rig.calibration import Calibrated
 from bench.rig.derived import Derived, DerivedSignal
 from bench.rig.description import RigDescription
 from bench.rig.file import DeviceEntry, Laboratory, RigFile
+from bench.rig.interlocks.config import SETPOINT
 from bench.rig.maintenance.safe_state import SAFE, make_safe
 from bench.rig.readables import ReadableSignal
 from bench.rig.slots import check_roles
@@ -100,7 +101,7 @@ class Rig:
                 self.devices[entry.name] = device
             self.derived: dict[str, Derived] = {}
             self.signals = self._bind_signals()
-            self._setpoint_names = {name: f"{name}_setpoint" for name in self.actuators}
+            self._setpoint_names = {name: f"{name}{SETPOINT}" for name in self.actuators}
             self._read_before: dict[tuple[Look, frozenset[str]], dict[str, Callable[[], dict[str, float]]]] = {}
             described = RigDescription(file, self._describe_devices(), self.signals)
             self.signals = tuple(

@@ -31,6 +31,7 @@ from pydantic import Field, field_validator, model_validator
 
 from bench.base import CheckedTable, ConfigurationError, Display, closest, difference_unit
 from bench.devices import Device, DeviceDescription, Dwell, Settle, Signal, UntilSteady
+from bench.rig.interlocks.config import SETPOINT
 from bench.rig.layout import Range
 
 
@@ -164,7 +165,7 @@ class Slot:
     @property
     def setpoint_signal(self) -> str:
         """Signal with the set-points of the device."""
-        return f"{self.device}_setpoint"
+        return f"{self.device}{SETPOINT}"
 
     def show(self, value: float) -> str:
         """Return a value of the signal with its unit, for notes."""
@@ -272,7 +273,7 @@ def reading_of(table: RoleTable, devices: Mapping[str, DeviceDescription]) -> st
     if table.signal or table.reading:
         return table.signal or table.reading
     # A device without signals of its own has its set-point.
-    return next((signal.name for signal in devices[table.device].signals), f"{table.device}_setpoint")
+    return next((signal.name for signal in devices[table.device].signals), f"{table.device}{SETPOINT}")
 
 
 def check_roles(

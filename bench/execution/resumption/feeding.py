@@ -32,7 +32,7 @@ from bench.protocol import (
     Step,
 )
 from bench.record import Record, StepRecord, Table
-from bench.rig import Slots
+from bench.rig import SETPOINT, Slots
 
 _LEAST_TURN = 0.01
 """Smallest turn under a controller that counts as a corner, as a share of what the actuator went through."""
@@ -374,7 +374,7 @@ class _Feeding:
         record, fed = self._record, self._fed
         self._check_label(message.label)
         names = (message.drive, message.response, *message.others)
-        setpoint = f"{message.actuator}_setpoint"
+        setpoint = f"{message.actuator}{SETPOINT}"
         ticks = fed.past.ticks.ticks_of(record)
         rows = self._seen(ticks)
         command = None
@@ -424,7 +424,7 @@ class _Feeding:
         if not isinstance(message.controller, Playback):
             fed.spent.append(message.controller)
         ticks = fed.past.ticks.ticks_of(record)
-        paths = {name: ticks[f"{name}_setpoint"].tolist() for name in message.actuators}
+        paths = {name: ticks[f"{name}{SETPOINT}"].tolist() for name in message.actuators}
         turns: set[int] = set()
         for name, path in paths.items():
             if all(map(math.isfinite, path)):

@@ -13,7 +13,7 @@ from bench.execution.resumption.feeding import Past, feed
 from bench.execution.resumption.repriming import RESUMED, Resumption
 from bench.protocol import LATENESS, TRACES, ProtocolDefinition, ProtocolParameters
 from bench.record import Event, Journal
-from bench.rig import RigDescription, Slots
+from bench.rig import SETPOINT, RigDescription, Slots
 
 _DESCRIBED = ("operator", "command", "packages", "git", "host", "devices", "rig_content", "protocol_source")
 """What is kept of each process that takes a run up."""
@@ -99,7 +99,7 @@ class Interrupted:
             fed.check_fresh(fed.message)
         measured = [slot.signal for slot in slots.values()]
         if not measured:
-            setpoints = {f"{name}_setpoint" for name in description.devices}
+            setpoints = {f"{name}{SETPOINT}" for name in description.devices}
             measured = [signal.name for signal in description.signals if signal.name not in setpoints]
         compared = tuple(name for name in dict.fromkeys(measured) if name in self.past.names and name not in traced)
         zero = 0.0 if self.meta["laboratory_epoch"] is None else (self._epoch - clock.epoch).total_seconds()
