@@ -16,7 +16,7 @@ from bench.devices import DriverSettings
 from bench.rig import EMULATED, LaboratorySettings
 from bench.specimen import BoardTable, NoiseTable, Specimen, TwinSettings, TwinTable, rounded
 from sim_devices.instruments.controller_board import ControllerBoard
-from sim_devices.instruments.twin import EmulatedTwin, TwinServer
+from sim_devices.instruments.twin import EmulatedTwin
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.wire import WireServer
 from sim_devices.world import World
@@ -146,7 +146,7 @@ class TwinLaboratory(EmulatedLaboratory):
             instruments[table.port.removeprefix(EMULATED)] = EmulatedTwin(
                 name, world, table, meters, rng, partial(self._act, name)
             )
-        servers: dict[str, WireServer] = {port: TwinServer(each) for port, each in instruments.items()}
+        servers: dict[str, WireServer] = {**instruments}
         known: dict[str, object] = {**instruments}
         if settings.board is not None:
             port, board = self._board(settings.board, world, reading_stream)

@@ -11,15 +11,14 @@ from pathlib import Path
 
 from bench.base import ConfigurationError
 from bench.deployment import compile_library
-from sim_devices.instruments.emulated import Pluggable
-from sim_devices.wire.text import LineServer
+from sim_devices.wire.text import AttendedLine
 from sim_devices.world import World
 
 _ANSWER = 80
 """Bytes that an answer has room for."""
 
 
-class ControllerBoard(Pluggable, LineServer):
+class ControllerBoard(AttendedLine):
     """A board that reads a specimen and sets its input each period; see `board.c` in the folder of its firmware.
 
     Parameters
@@ -67,14 +66,6 @@ class ControllerBoard(Pluggable, LineServer):
         """Read, and set the input."""
         self._due += self._period
         self._drive(self._library.board_tick(self._period, *self._read()))
-
-    def receive(self, data: bytes) -> bytes:
-        """Take bytes from the host, in pieces of any size; return what the board sends."""
-        with self.world.lock:
-            if not self.answering:
-                return b""
-            self.attend()
-            return super().receive(data)
 
     def answer(self, message: str) -> str | None:
         """Let the firmware obey a line."""

@@ -24,14 +24,12 @@ from bench.specimen import (
     rounded,
 )
 from sim_devices.instruments.emulated import EmulatedInstrument
-from sim_devices.wire import WireServer
+from sim_devices.wire.text import AttendedLine
 from sim_devices.world import World
 
-_LONGEST = 4096
 
-
-class EmulatedTwin(EmulatedInstrument):
-    """A device of a twin.
+class EmulatedTwin(EmulatedInstrument, AttendedLine):
+    """A device of a twin, which serves its own line: a request and an answer a line of text.
 
     Parameters
     ----------
@@ -42,6 +40,8 @@ class EmulatedTwin(EmulatedInstrument):
     act : callable
         Takes what its output delivers from now on; nan when it is off.
     """
+
+    end = END
 
     def __init__(
         self,
@@ -79,8 +79,9 @@ class EmulatedTwin(EmulatedInstrument):
         with self.world.at_present():
             self._switch(math.nan)
 
-    def obey(self, request: str) -> str:
+    def answer(self, message: str) -> str:
         """Carry a request out; return the answer."""
+        request = message.strip()
         if request in (MEASURE, GLANCE):
             return " ".join(number_text(self._read(name, quick=request == GLANCE)) for name in self._meters)
         if request == IDENTITY:
@@ -109,28 +110,3 @@ class EmulatedTwin(EmulatedInstrument):
     def _read(self, name: str, *, quick: bool) -> float:
         true, noise = self._meters[name]
         return rounded(true() + self._draw(noise.quick if quick else noise.reading), noise.resolution)
-
-
-class TwinServer(WireServer):
-    """The line of a twin's device: a request and an answer a line of text."""
-
-    protocol = "lines of text"
-    is_text = True
-
-    def __init__(self, instrument: EmulatedTwin) -> None:
-        self._instrument = instrument
-        self._received = b""
-
-    def receive(self, data: bytes) -> bytes:
-        """Take bytes from the host, in pieces of any size; return what the device sends."""
-        instrument = self._instrument
-        with instrument.world.lock:
-            *requests, rest = (self._received + data).split(END)
-            if not instrument.answering:
-                self._received = b""
-                return b""
-            instrument.attend()
-            self._received = rest if len(rest) <= _LONGEST else b""
-            return b"".join(
-                instrument.obey(each.decode("ascii", "replace").strip()).encode() + END for each in requests
-            )

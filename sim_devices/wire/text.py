@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import ClassVar
 
+from sim_devices.instruments.emulated import Pluggable
 from sim_devices.instruments.scpi import INPUT_OVERRUN, LONGEST_MESSAGE, EmulatedTextInstrument
 from sim_devices.wire import WireServer
 
@@ -33,6 +34,19 @@ class LineServer(WireServer):
         self._received = rest if len(rest) <= LONGEST_MESSAGE else b""
         answers = [self.answer(line.decode("ascii", "replace")) for line in lines]
         return b"".join(answer.encode("ascii", "replace") + self.end for answer in answers if answer is not None)
+
+
+class AttendedLine(Pluggable, LineServer):
+    """An instrument that serves its own line of text, and keeps silent while it is unplugged."""
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes from the host, in pieces of any size; return what the instrument sends."""
+        with self.world.lock:
+            if not self.answering:
+                self._received = b""
+                return b""
+            self.attend()
+            return super().receive(data)
 
 
 class TextServer(WireServer):
