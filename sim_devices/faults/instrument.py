@@ -6,7 +6,7 @@ from functools import partial
 from typing import Protocol, runtime_checkable
 
 from sim_devices.faults.fault import Fault
-from sim_devices.faults.line import FaultyLine
+from sim_devices.faults.line import Cable, FaultyLine
 
 
 @runtime_checkable
@@ -76,7 +76,7 @@ def _exchange(instrument: Exchangeable, line: FaultyLine, serial_number: int) ->
 
 def _lose_power(instrument: PowerCycled, line: FaultyLine) -> None:
     instrument.power_cycle()
-    line.lose_power()
+    line.break_off(Cable.CUT)
 
 
 def _regain_power(instrument: PowerCycled, line: FaultyLine) -> None:

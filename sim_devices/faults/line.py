@@ -224,10 +224,6 @@ class FaultyLine:
         """Return how many answers a disturbance has met so far."""
         return self._disturbances[kind].done if kind in self._disturbances else 0
 
-    def lose_power(self) -> None:
-        """Be dead until `mend`: the instrument has no power."""
-        self.break_off(Cable.CUT)
-
     def restart(self) -> None:
         """Lose what is on its way, and connections on TCP: the instrument has lost its power."""
         self._lose(ends=True)

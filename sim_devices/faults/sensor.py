@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -75,8 +76,8 @@ class FaultySensor:
             f"{name}.{kind}": Fault(f"the sensor of {name} {summary}", begin, values, undo, lies=True)
             for kind, summary, begin, values, undo in (
                 ("stuck", "stands still", self._stick, {}, self._come_loose),
-                ("noisy", "is noisy", self._be_noisy, {"rms": noise}, self._be_quiet),
-                ("drifting", "drifts", self._drift, {"slope": slope}, self._stop_drifting),
+                ("noisy", "is noisy", self._be_noisy, {"rms": noise}, partial(self._be_noisy, 0.0)),
+                ("drifting", "drifts", self._drift, {"slope": slope}, partial(self._drift, 0.0)),
                 ("out-of-range", "sees a value out of its range", self._leave, {"value": place}, self._return),
             )
         }
@@ -105,15 +106,9 @@ class FaultySensor:
         self._noise = rms
         self._look()
 
-    def _be_quiet(self) -> None:
-        self._be_noisy(0.0)
-
     def _drift(self, slope: float) -> None:
         self._slope, self._since = slope, self._world.time
         self._look()
-
-    def _stop_drifting(self) -> None:
-        self._drift(0.0)
 
     def _leave(self, value: float) -> None:
         self._elsewhere = value

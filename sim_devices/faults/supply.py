@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.instruments.meerstetter_tec import PeltierLoad
@@ -21,7 +22,8 @@ class ClippedPeltier:
     def fault(self, amperes: float) -> Fault:
         """Return the fault, with the highest current (A) where none is chosen."""
         highest = Quantity(amperes, "A", 0.0, 100.0, "highest current of either sign")
-        return Fault("the supply of the TEC controller is clipped", self._clip, {"amperes": highest}, self._unclip)
+        undo = partial(self._clip, math.inf)
+        return Fault("the supply of the TEC controller is clipped", self._clip, {"amperes": highest}, undo)
 
     @property
     def plate_temperature(self) -> float:
@@ -61,6 +63,3 @@ class ClippedPeltier:
     def _clip(self, amperes: float) -> None:
         self._highest = amperes
         self._repeat()
-
-    def _unclip(self) -> None:
-        self._clip(math.inf)
