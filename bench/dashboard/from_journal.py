@@ -80,8 +80,8 @@ class JournalView:
         with Record(self._run) as record:
             # Whether it has ended first: what is read then is all.
             end = _end_of(record)
-            self._show(self._tail.parts(record))
-        self._show(end)
+            self.show(self._tail.parts(record))
+        self.show(end)
         return end[0].status if end else ""
 
     def entries(self) -> list[tuple[float, Entry]]:
@@ -90,11 +90,8 @@ class JournalView:
             entries = [(time_of(entry), entry) for entry in single(self._tail.parts(record))]
             return entries + [(entries[-1][0] if entries else 0.0, end) for end in _end_of(record)]
 
-    def show(self, entries: Sequence[Entry]) -> None:
+    def show(self, parts: Sequence[Entry | Part]) -> None:
         """Show entries; viewers get them at once."""
-        self._show(entries)
-
-    def _show(self, parts: Sequence[Entry | Part]) -> None:
         if parts:
             _write(self._writer, parts)
             self._writer.arrange()

@@ -242,9 +242,7 @@ class Engine:
     ) -> Reading:
         """Settle from `since` on, take the reading and record it, also that of a rule that was not met."""
         settled, failure = self._settle(settle, since)
-        values = self._run.look(Look.MEASURE)
-        self._run.judge(self._clock.now(), values)
-        reading = self._run.finish_step(started, label, setpoints, values, settled)
+        reading = self._run.measure_step(started, label, setpoints, settled)
         if failure is not None:
             raise failure
         return reading

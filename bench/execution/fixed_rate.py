@@ -13,7 +13,7 @@ from bench.devices import Settled
 from bench.execution.run_at_hand import NOT_AT_WORK, RunAtHand, row_of, traced
 from bench.protocol import LATENESS, FixedRate, Reading
 from bench.record import Lateness
-from bench.rig import Look
+from bench.rig import SETPOINT
 
 _PERIODS_OF_GRACE = 5
 """Periods of a loop beyond the next sample by which the station expects to hear from it."""
@@ -49,7 +49,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     controller, inputs = message.controller, message.inputs
     assert isinstance(controller, SampledController)
     clock, update = run.clock, controller.update
-    setpoints = [f"{name}_setpoint" for name in message.actuators]
+    setpoints = [f"{name}{SETPOINT}" for name in message.actuators]
     lowest, highest = ([each[side] for each in message.limits] for side in (0, 1))
     read = run.station.quick_reader(inputs)
     # What is watched is for the record alone.
@@ -122,7 +122,7 @@ def _blocks(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     """Carry a fixed rate out block by block; see `FixedRate.block`."""
     controller, clock = message.controller, run.clock
     assert isinstance(controller, BlockController)
-    setpoints = [f"{name}_setpoint" for name in message.actuators]
+    setpoints = [f"{name}{SETPOINT}" for name in message.actuators]
     signals = (*message.inputs, *message.watched)
     samples = message.samples
     if message.block * period > run.period:
@@ -214,7 +214,5 @@ def _finish(
         f"{taken} samples at {message.rate:g} Hz, {samples - taken} left out; late by "
         f"{1e3 * lateness.total / taken:.3g} ms on average, {1e3 * lateness.worst:.3g} ms at most",
     )
-    values = run.look(Look.MEASURE)
-    run.judge(run.clock.now(), values)
     sent = dict(zip(message.actuators, commands, strict=True))
-    return run.finish_step(started, message.label, sent, values, Settled.CONTROLLED)
+    return run.measure_step(started, message.label, sent, Settled.CONTROLLED)

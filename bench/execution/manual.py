@@ -10,7 +10,6 @@ from bench.devices import Settled
 from bench.execution.run_at_hand import RunAtHand
 from bench.operator import Command, Desk, HoldAll, Leave, Remark, Rest, SetPoint, Shown, Tare
 from bench.protocol import ByHand, Reading
-from bench.rig import Look
 
 _PERIOD = 0.5
 """Longest time between two looks for a command, s."""
@@ -91,13 +90,7 @@ class _Hands:
         run = self._run
         started = run.clock.now()
         run.station.apply(setpoints)
-        self._record(started, setpoints, label)
-
-    def _record(self, started: float, setpoints: Mapping[str, float], label: str) -> Reading:
-        run = self._run
-        values = run.look(Look.MEASURE)
-        run.judge(run.clock.now(), values)
-        return run.finish_step(started, label, setpoints, values, Settled.UNRECORDED)
+        run.measure_step(started, label, setpoints, Settled.UNRECORDED)
 
     def advance(self) -> None:
         """Send what the ramps have come to."""
@@ -127,4 +120,4 @@ class _Hands:
 
     def leave(self) -> Reading:
         """Return the last reading."""
-        return self._record(self._run.clock.now(), {}, "end")
+        return self._run.measure_step(self._run.clock.now(), "end", {}, Settled.UNRECORDED)

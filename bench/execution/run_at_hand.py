@@ -296,6 +296,12 @@ class RunAtHand:
         self._tell(lambda observer: observer.step(record))
         return Reading(record.step, record.finished, record.settled, values)
 
+    def measure_step(self, started: float, label: str, setpoints: Mapping[str, float], settled: Settled) -> Reading:
+        """Take the reading of a step, have it judged by the interlocks, and finish the step with it."""
+        values = self.look(Look.MEASURE)
+        self.judge(self.clock.now(), values)
+        return self.finish_step(started, label, setpoints, values, settled)
+
     def event(self, level: str, kind: str, text: str) -> None:
         """Write down that something happened, then notify the observers."""
         event = Event(self.clock.now() - self.zero, level, kind, text)
