@@ -35,7 +35,7 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
@@ -47,7 +47,7 @@ from bench.base import DeferredModule, DeviceError
 from bench.devices import Identity, LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice, Pluggable
 from sim_devices.instruments.registers import Register, RegisterInstrument
-from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, Frame, Packet, RegisterError
+from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
 
 if TYPE_CHECKING:
@@ -494,23 +494,6 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
                     reads.words.unpack_from(reads.values.pack(*[read() for read in reads.read]), reads.skipped)
                 )
         return super().read_registers(address, count)
-
-    def prepare(self, frames: Sequence[Frame], heads: Sequence[int]) -> Packet | None:
-        """Return what carries a packet that reads neighbouring registers out; None of any other."""
-        packet = super().prepare(frames, heads)
-        if packet is None or len(frames) > 1 or frames[0].writes:
-            return None
-        if frames[0].address not in _SET_UP_REGISTERS:
-            return packet
-        reads = self._reads(frames[0].address, frames[0].number)
-
-        def read_set_up(request: bytes) -> bytes:
-            if self._written:
-                return packet(request)
-            with self.world.lock:
-                return reads.values.pack(*[read() for read in reads.read])
-
-        return read_set_up
 
     def write_registers(self, address: int, values: list[int]) -> None:
         """Write registers from `address` on, in whole values; errors are those of the base class."""

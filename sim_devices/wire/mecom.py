@@ -21,11 +21,10 @@ from __future__ import annotations
 
 import re
 import struct
-from binascii import crc_hqx, hexlify, unhexlify
+from binascii import crc_hqx, hexlify
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.meerstetter_table import Parameter, ServerError, find_parameter
@@ -40,10 +39,8 @@ _SILENT = 255
 _SHORTEST_FRAME = 11
 _PREAMBLE = re.compile(rb"#[0-9A-F]{6}")
 _HEX = re.compile(r"[0-9A-F]*")
-_VALUE = re.compile(rb"[0-9A-F]{8}")
-_WRITE_HEAD = 8  # characters of a payload that writes: command and parameter, before the value
 _FORMS = {"INT32": struct.Struct(">i"), "FLOAT32": struct.Struct(">f")}
-_PARSED = 256  # payloads that are kept as parsed; a client that measures sends a few over and over
+_PARSED = 256  # payloads that are kept as parsed; a client sends a few over and over
 
 
 @dataclass(frozen=True)
@@ -55,14 +52,6 @@ class _Selection:
 
     def encode(self, values: list[float]) -> bytes:
         return hexlify(self.form.pack(*values)).upper()
-
-
-class _Writing(NamedTuple):
-    """A parameter that is written, and how its value is coded."""
-
-    row: Parameter
-    instance: int
-    form: struct.Struct
 
 
 class MeComServer(WireServer):
@@ -79,10 +68,6 @@ class MeComServer(WireServer):
     def __init__(self, device: EmulatedTEC) -> None:
         self._device = device
         self._received = b""
-        self._selections: dict[bytes, _Selection] = {}
-        """What the payloads that only read select, of those that came last."""
-        self._writes: dict[bytes, _Writing] = {}
-        """What the payloads that write one value begin with, of those that came last."""
         self._commands: dict[str, Callable[[str], str]] = {
             "VS": self._write,
             "?VL": self._limits,
@@ -131,17 +116,7 @@ class MeComServer(WireServer):
         head = b"!" + body[1:7]
         try:
             payload = body[7:]
-            # A client sends a few payloads over and over, those that write with other values.
-            if (selection := self._selections.get(payload)) is not None:
-                content = self._values(selection)
-            elif (writing := self._writes.get(payload[:_WRITE_HEAD])) is not None and _VALUE.fullmatch(
-                payload, _WRITE_HEAD
-            ):
-                row, instance, form = writing
-                device.assign(row, _number(form, unhexlify(payload[_WRITE_HEAD:])), instance)
-                content = b""
-            else:
-                content = self._act(payload)
+            content = self._act(payload)
         except RequestRefusedError as error:
             content = b"+%02X" % error.reason
         if number == _SILENT:
@@ -152,14 +127,8 @@ class MeComServer(WireServer):
 
     def _act(self, request: bytes) -> bytes:
         """Carry a request out; return the payload of the answer, empty for an acknowledge."""
-        payload = request.decode("ascii", "replace")
-        command = payload[:3] if payload.startswith("?") else payload[:2]
-        operand = payload[len(command) :]
-        if command in ("?VR", "?VX"):
-            selection = _single(operand) if command == "?VR" else _several(operand)
-            if len(self._selections) >= _PARSED:
-                self._selections.clear()
-            self._selections[request] = selection
+        command, operand, selection = _parsed(request)
+        if selection is not None:
             return self._values(selection)
         try:
             carry_out = self._commands[command]
@@ -174,9 +143,6 @@ class MeComServer(WireServer):
     def _write(self, operand: str) -> str:
         _check_digits(operand, 14)
         row, instance = _row(operand)
-        if len(self._writes) >= _PARSED:
-            self._writes.clear()
-        self._writes[b"VS" + operand[:6].encode("ascii")] = _Writing(row, instance, _FORMS[row.kind])
         self._device.assign(row, _decode(row, operand[6:]), instance)
         return ""
 
@@ -225,6 +191,17 @@ class MeComServer(WireServer):
     def _change_speed(self, operand: str) -> str:
         _check_digits(operand, 8)
         return ""
+
+
+@lru_cache(_PARSED)
+def _parsed(request: bytes) -> tuple[str, str, _Selection | None]:
+    """Return command and operand of a payload, and of one that only reads parameters which these are."""
+    payload = request.decode("ascii", "replace")
+    command = payload[:3] if payload.startswith("?") else payload[:2]
+    operand = payload[len(command) :]
+    if command == "?VR":
+        return command, operand, _single(operand)
+    return command, operand, _several(operand) if command == "?VX" else None
 
 
 def _row(operand: str) -> tuple[Parameter, int]:

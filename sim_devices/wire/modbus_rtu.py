@@ -17,19 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import NamedTuple
 
 from bench.base import crc16_modbus as crc16
 from sim_devices.instruments.emulated import Pluggable
 from sim_devices.wire import WireServer
-from sim_devices.wire.modbus import READS, Packet, RegisterBank, answer, prepare, refusal
+from sim_devices.wire.modbus import RegisterBank, answer
 
 BROADCAST = 0
 LONGEST_FRAME = 256
 """Bytes of the longest frame, Serial Line 2.5.1."""
 
 _SHORTEST_FRAME = 4
-_MOST_KNOWN = 256
 _FIXED: Mapping[int, int] = {
     **dict.fromkeys((1, 2, 3, 4, 5, 6, 8), 8),
     **dict.fromkeys((7, 11, 12, 17), 4),
@@ -43,17 +41,8 @@ _COUNTED: Mapping[int, tuple[int, int]] = {15: (9, 6), 16: (9, 6), 20: (5, 2), 2
 """Bytes of a request without its data, and where the number of bytes of its data stands."""
 
 
-_crc_of_reply = lru_cache(maxsize=1024)(crc16)
-"""What is at rest gives the same few readings."""
-
-
-class _Known(NamedTuple):
-    """What a request that only reads takes when it comes again."""
-
-    packet: Packet
-    """Carries it out."""
-    head: bytes
-    """What stands before the values of the reply."""
+_known_crc = lru_cache(maxsize=1024)(crc16)
+"""A host asks the same few requests again and again, and what is at rest gives the same few readings."""
 
 
 class ModbusRtuServer(WireServer):
@@ -82,8 +71,6 @@ class ModbusRtuServer(WireServer):
         self._address = address
         self._line = bank if isinstance(bank, Pluggable) else None
         self._received = bytearray()
-        # A host asks the same few again and again.
-        self._known: dict[bytes, _Known] = {}
 
     @property
     def address(self) -> int:
@@ -102,14 +89,7 @@ class ModbusRtuServer(WireServer):
             return b""
         if not self._received:
             # The usual case: a client that sends one request and waits.
-            known = self._known.get(data)
-            if known is not None:
-                try:
-                    return self._sealed(known.head + known.packet(data))
-                except Exception as error:
-                    return self._sealed(data[:1] + refusal(data[1:-2], error))
             if self._is_request(data):
-                self._learn(data)
                 return self._serve(data)
             if (
                 data[:1] not in (bytes((self._address,)), b"\0")
@@ -137,16 +117,8 @@ class ModbusRtuServer(WireServer):
             len(data) >= _SHORTEST_FRAME
             and data[0] == self._address
             and _length(data) == len(data)
-            and data[-2:] == crc16(data[:-2])
+            and data[-2:] == _known_crc(data[:-2])
         )
-
-    def _learn(self, frame: bytes) -> None:
-        """Prepare for a request that may come again."""
-        prepared = prepare(self._bank, frame[1:-2], 1) if frame[1] in READS else None
-        if prepared is not None:
-            if len(self._known) >= _MOST_KNOWN:
-                self._known.clear()
-            self._known[frame] = _Known(prepared.packet, frame[:1] + prepared.head)
 
     def _find(self, received: memoryview) -> tuple[int, int] | None:
         """Return where the first whole request begins and ends."""
@@ -167,10 +139,7 @@ class ModbusRtuServer(WireServer):
         if address not in (self._address, BROADCAST):
             return b""
         reply = frame[:1] + answer(self._bank, frame[1:-2])
-        return b"" if address == BROADCAST else self._sealed(reply)
-
-    def _sealed(self, reply: bytes) -> bytes:
-        return reply + _crc_of_reply(reply)
+        return b"" if address == BROADCAST else reply + _known_crc(reply)
 
 
 def _length(received: bytes | memoryview) -> int | None:
