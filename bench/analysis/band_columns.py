@@ -1,4 +1,4 @@
-"""Prediction bands beside predictions and inverted set-points: what the commands write and print."""
+"""Prediction bands beside predictions: what the commands write and print."""
 
 from __future__ import annotations
 
@@ -17,10 +17,8 @@ from bench.identification import (
     Regularization,
     calibrate_band,
     calibrate_band_in_time,
-    input_half_widths,
     set_up_problem,
 )
-from bench.models import Operator
 
 
 @dataclass(frozen=True)
@@ -90,37 +88,6 @@ def band_of(model: ModelFile) -> BandedPrediction | None:
     if model.band is None:
         return None
     return BandedPrediction(model.band, model.response.output_unit, model.valid.text(model.response.input_unit))
-
-
-def setpoint_half_widths(
-    model: ModelFile,
-    setpoints: Floats,
-    passing: Floats,
-    state: Any = None,  # noqa: ANN401 - each operator has its own
-) -> Floats | None:
-    """Return the half-width about each set-point that an inverse found within which the target is met, shape (N,).
-
-    It is that of the band of the output over the local slope, in input units; nan where that is more than the
-    operating range, as the output hardly moves with the input. None without a band, and of a model with time, whose
-    output depends on more than the last set-point.
-
-    Parameters
-    ----------
-    model : ModelFile
-        The model.
-    setpoints : ndarray, shape (N,)
-        Input units.
-    passing : ndarray, shape (N,)
-        Set-point to pass before each; nan where there is none.
-    state : object
-        State before the first target; None is the initial one.
-    """
-    if model.band is None or not isinstance(model.model, Operator):
-        return None
-    both = np.column_stack([passing, setpoints]).ravel()
-    taken = np.isfinite(both)
-    places = (np.cumsum(taken) - 1)[1::2]
-    return np.asarray(input_half_widths(model.model, both[taken], model.band.half_width, state)[places])
 
 
 def calibrate(

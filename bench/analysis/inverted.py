@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.applied import check_finite
-from bench.analysis.band_columns import BandedPrediction, band_of, setpoint_half_widths
+from bench.analysis.band_columns import BandedPrediction, band_of
 from bench.analysis.tables.starting_state import bind_times, starting_state
-from bench.analysis.uncertain_models import setpoint_uncertainty
-from bench.base import ConfigurationError, DataError, Floats, header_with_unit
-from bench.identification import Beyond, ModelFile
-from bench.models import Policy, Reach, TimedSequence
+from bench.analysis.uncertain_models import predicted_uncertainty
+from bench.base import ConfigurationError, DataError, Floats, difference_unit, header_with_unit
+from bench.identification import Beyond, ModelFile, input_half_widths
+from bench.models import Operator, Policy, Reach, TimedSequence
 
 # Part of the span of all outputs and targets within which a target over time counts as met, and of a time step within
 # which two times are the same. Derivation: a million times the rounding of one number, less than any sensor tells.
@@ -87,8 +87,16 @@ class InvertedTargets:
         """Return the columns of a file with their heads; cells are empty where there is no value."""
         response = self.file.response
         driven, output = response.input_unit, response.output_unit
-        widths = setpoint_half_widths(self.file, self.setpoints, self.passing, self.state)
-        ends = [] if widths is None else [("lower", self.setpoints - widths), ("upper", self.setpoints + widths)]
+        ends: list[tuple[str, Floats]] = []
+        uncertain: list[tuple[str, Floats | list[object]]] = []
+        if isinstance(self.file.model, Operator):
+            if self.file.band is not None:
+                widths = self._input_widths(self.file.model, self.file.band.half_width)
+                ends = [("lower", self.setpoints - widths), ("upper", self.setpoints + widths)]
+            if (standard := predicted_uncertainty(self.file, self.predicted)) is not None:
+                cells = _cells(self._input_widths(self.file.model, standard))
+                uncertain.append((header_with_unit("u_setpoint", difference_unit(driven)), cells))
+                uncertain.append((header_with_unit("u_predicted", output), standard))
         return [
             *([] if self.times is None else [(header_with_unit("time", "s"), self.times)]),
             (header_with_unit("target", output), self.targets),
@@ -96,10 +104,22 @@ class InvertedTargets:
             (header_with_unit("setpoint", driven), self.setpoints),
             (header_with_unit("predicted", output), self.predicted),
             ("flag", list(self.flags)),
-            *setpoint_uncertainty(self.file, self.setpoints, self.predicted, self.state),
+            *uncertain,
             *((header_with_unit(f"setpoint {end}", driven), _cells(values)) for end, values in ends),
             *(self.band.columns(self.predicted) if self.band else ()),
         ]
+
+    def _input_widths(self, operator: Operator[Any], half_widths: Floats | float) -> Floats:
+        """Return half-widths of the output, shape (N,) or one, over the slopes at the set-points, shape (N,).
+
+        The path of the memory has the set-points that are passed on the way. A width is nan where the output hardly
+        moves with the input, see `input_half_widths`.
+        """
+        both = np.column_stack([self.passing, self.setpoints]).ravel()
+        taken = np.isfinite(both)
+        of_path = np.repeat(np.broadcast_to(half_widths, self.setpoints.shape), 2)[taken]
+        places = (np.cumsum(taken) - 1)[1::2]
+        return np.asarray(input_half_widths(operator, both[taken], of_path, self.state)[places])
 
     def to_json(self) -> dict[str, Any]:
         """Return what was found for programs."""

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from bench.analysis.uncertain_results import over_range, rounded, uncertain_signals
-from bench.base import Floats, difference_unit, header_with_unit
-from bench.identification import ModelFile, input_half_widths
+from bench.base import Floats
+from bench.identification import ModelFile
 from bench.models import Operator
 from bench.record import Record
 from bench.rig import OWN, Budget, BudgetRow, Part, UncertainSignals, effective_freedom
@@ -297,22 +297,3 @@ def predicted_uncertainty(model: ModelFile, outputs: Floats) -> Floats | None:
     if not known or (rms := model.provenance.get("rms")) is None:
         return None
     return np.asarray(np.hypot(rms, np.interp(outputs, known["outputs"], known["standard"])))
-
-
-def setpoint_uncertainty(
-    model: ModelFile,
-    setpoints: Floats,
-    predicted: Floats,
-    state: Any = None,  # noqa: ANN401 - each operator has its own
-) -> list[tuple[str, Floats | list[object]]]:
-    """Return the columns `u_setpoint` and `u_predicted` of inverted set-points; none if the model file has none.
-
-    The first is the second over the slope of the model there, and empty where that is flat.
-    """
-    standard = predicted_uncertainty(model, predicted)
-    if standard is None or not isinstance(model.model, Operator):
-        return []
-    widths = input_half_widths(model.operator, setpoints, standard, state)
-    cells: list[object] = ["" if width != width else width for width in widths.tolist()]
-    units = difference_unit(model.operator.input_unit), model.operator.output_unit
-    return [(header_with_unit("u_setpoint", units[0]), cells), (header_with_unit("u_predicted", units[1]), standard)]

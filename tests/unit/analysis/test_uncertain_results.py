@@ -4,14 +4,17 @@ import json
 
 import numpy as np
 import pytest
+from film import film_model
 from typer.testing import CliRunner
 
 import bench
 from bench.analysis import export_run
-from bench.analysis.uncertain_models import predicted_uncertainty, propagated
+from bench.analysis.inverted import invert_targets
+from bench.analysis.uncertain_models import PROVENANCE, predicted_uncertainty, propagated
 from bench.analysis.uncertain_results import control_uncertainties, draw_errors, signal_budgets, uncertain_signals
 from bench.base import ConfigurationError
 from bench.cli import app
+from bench.identification import ModelFile
 from bench.record import Record
 
 
@@ -85,6 +88,25 @@ def test_a_model_of_a_run_has_the_uncertainty_of_its_sensor(run):
     standard = predicted_uncertainty(found.file, np.array([100.0, 1500.0]))
     assert standard is not None
     assert (standard > found.file.provenance["rms"]).all()
+
+
+def test_the_uncertainty_of_a_setpoint_behind_saturation_is_by_the_branch_from_there():
+    operator = film_model()
+    least, greatest = operator.output_range()
+    known = {"outputs": [least, greatest], "standard": [0.0, 0.0]}
+    file = ModelFile("film", operator, provenance={"rms": 2.0, PROVENANCE: known})
+    state = operator.initial_state()
+    targets = np.linspace(least + 60.0, greatest - 1.0, 12)[[6, 11, 3, 10]]
+    found = invert_targets(file, targets)
+    widths = dict(found.table())["u_setpoint [K]"]
+    assert found.through_saturation
+    for passed, setpoint, width in zip(found.passing.tolist(), found.setpoints.tolist(), widths, strict=True):
+        state = state if np.isnan(passed) else state.step(passed)
+        near = setpoint + 1e-3 * np.sign(state.input - setpoint)
+        before = state.step(near)
+        slope = (operator.value(before.step(setpoint)) - operator.value(before)) / (setpoint - near)
+        assert width == pytest.approx(2.0 / abs(slope), rel=0.05)
+        state = state.step(setpoint)
 
 
 def test_a_model_of_a_computed_signal_has_the_uncertainty_of_all_behind_it(run):

@@ -8,11 +8,10 @@ from other_plants import measured, random_reversals
 from rerun.chunk import RrdReader
 
 import bench as bench_functions
-from bench.analysis.band_columns import setpoint_half_widths
 from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
-from bench.identification import ModelFile, calibrate_band, identify, set_up_problem
+from bench.identification import ModelFile, calibrate_band, identify, input_half_widths, set_up_problem
 from bench.protocol import TRACES, Settled
 from bench.record import StepRecord
 from bench.rig import DashboardLayout
@@ -179,7 +178,7 @@ def test_the_band_about_the_setpoints_is_that_of_invert(tmp_path, model):
     found = written(tmp_path / "run.rrd", controlled(inputs, np.zeros(inputs.size)), [model])
     path = inputs[np.append(True, np.diff(inputs) != 0.0)]
     state = model.operator.advance(model.operator.initial_state(), [0.8])
-    expected = setpoint_half_widths(model, path, np.full(path.size, np.nan), state)
+    expected = input_half_widths(model.operator, path, model.band.half_width, state)
     lower, upper, _ = merged(found[SETPOINT_BAND][ticks_of(found[SETPOINT_BAND], inputs)])
     # Each is there until the next, a hole where the output hardly moves with the input.
     moves = np.cumsum(np.append(False, np.diff(inputs) != 0.0))
