@@ -199,7 +199,7 @@ class Latched(Correcting):
             parameters.nearest, hold=2.0 * self._poll, poll=self._poll, patience=2.0 * parameters.rest
         )
         self._saturated = sorted(inverse.operator.evaluate(inverse.operator.levels[[0, -1]]).tolist())
-        self._operator = inverse.operator
+        self._preisach = inverse
         self.extreme: float | None = None
         """The input behind which the output is locked, input units; None while it is not."""
         self._direction: Direction
@@ -287,7 +287,7 @@ class Latched(Correcting):
         # Between two readings the locked output moves by what the input wanders unseen.
         locked = DisturbanceEstimator(walk_variance=(p.locked_slope * p.wander) ** 2, reading_variance=p.noise**2)
         origin = setpoint = self._behind(self.extreme - self._direction * p.step_back)
-        slope = reversible_slope(self._operator, origin)
+        slope = reversible_slope(self._preisach.operator, origin)
         for move in range(p.fine_moves + 1):
             for _ in range(max(1, round(p.lag / self._poll))):
                 reading = yield self._command(setpoint, self._poll)
@@ -312,7 +312,7 @@ class Latched(Correcting):
 
     def _ahead(self, target: float) -> float | None:
         """Return the input of the model's output `target` in the present direction, None beyond the limits."""
-        found = walk(self._operator, self.state, self._direction, target)
+        found = self._preisach.first_input(self.state, target, self._direction)
         return found if found is not None and self._low < found < self._high else None
 
 
@@ -323,28 +323,3 @@ def reversible_slope(operator: Preisach, value: float) -> float:
     breaks, quadratics = operator.reversible.pieces()
     _, linear, quadratic = quadratics[int((breaks < value).sum())].tolist()
     return float(linear + 2.0 * quadratic * value)
-
-
-def walk(operator: Preisach, state: MemoryCurve, direction: Direction, target: float) -> float | None:
-    """Return the first input in one direction (-1 or 1) at which the output has come to the target; None if nowhere.
-
-    Upwards the target is met by any output not below it, downwards by any not above it: perhaps by the present one.
-    """
-    missing = direction * (target - operator.value(state))
-    while missing > 0.0:
-        segment = operator.segment(state, direction)
-        if segment is None:
-            return None
-        # The output comes nearer by a d² + b d.
-        a, b = direction * segment.quadratic, direction * segment.linear
-        square = b * b + 4.0 * a * missing
-        # The smaller positive root, in the form that does not cancel; without a positive divisor there is none.
-        divisor = b + math.sqrt(square) if square >= 0.0 else 0.0
-        if divisor > 0.0 and 2.0 * missing / divisor <= segment.length:
-            return state.input + direction * 2.0 * missing / divisor
-        missing -= segment.length * (b + segment.length * a)
-        following = state.step(state.input + direction * segment.length)
-        if following.input == state.input:
-            return None
-        state = following
-    return state.input

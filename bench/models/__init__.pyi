@@ -114,7 +114,6 @@ from .operators.prandtl_ishlinskii import (
 )
 from .operators.preisach import (
     Preisach as Preisach,
-    Segment as Segment,
     uniform_levels as uniform_levels,
 )
 from .operators.reversible import (
@@ -131,9 +130,6 @@ from .operators.two_stage import (
     Summed as Summed,
     TwoStage as TwoStage,
 )
-from .operators.two_stage_state import (
-    TwoStageState as TwoStageState,
-)
 from .reach import (
     Reach as Reach,
 )
@@ -149,6 +145,7 @@ from .regressor import (
     Regressor as Regressor,
 )
 from .streams.coupled_stream import (
+    TwoStageState as TwoStageState,
     TwoStageStream as TwoStageStream,
 )
 from .streams.inverse_stream import (

@@ -451,6 +451,19 @@ class PreisachInverse(Inverse[MemoryCurve]):
         final = state.step(first).step(last)
         return Inversion((first, last), (turned, target + error), reach, iterations, final)
 
+    def first_input(self, state: MemoryCurve, target: float, direction: Literal[-1, 1]) -> float | None:
+        """Return the first input in one direction at which the output has come to a target; None if there is none.
+
+        Upwards the target is met by any output not below it, downwards by any not above it: perhaps by the present
+        one. Raises ValueError if the target is not finite.
+        """
+        from bench.models.kernels import inverse_kernels as _kernels
+
+        wanted = _checks.number("target", target)
+        start = self.operator._pieces(state)
+        found, error = _kernels.walk_state(*self._constants, start, state.input, wanted, direction)
+        return found if abs(error) <= 2.0 * self.tolerance else None
+
     def stream(self, state: MemoryCurve | None = None) -> PreisachInverseStream:
         """Return the inverse with a memory of its own, compiled; see `Inverse.stream`."""
         from bench.models.streams.inverse_stream import PreisachInverseStream

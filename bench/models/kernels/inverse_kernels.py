@@ -371,6 +371,18 @@ def invert(
     return count, first, final, e, steps + more
 
 
+@inlined
+def _loaded(operator: Operator, start: memory.Start, u: float) -> tuple[Curve, float]:
+    """Return the curve of a state, and its output."""
+    plane, below, offset, terms = operator
+    left, height, present = start
+    n = left.size
+    pieces = left, height, np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
+    k, mass = memory.load(plane, pieces, n, present)
+    value = memory.output_at(plane, below, offset, terms, u, present, k, mass)
+    return (left, height, pieces[2], n, mass, present), value
+
+
 @kernel
 def invert_state(
     operator: Operator,
@@ -381,13 +393,27 @@ def invert_state(
     target: float,
 ) -> tuple[int, float, float, float, int]:
     """Return what `invert` does, from a state whose output is not known yet."""
-    plane, below, offset, terms = operator
-    left, height, present = start
-    n = left.size
-    pieces = left, height, np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
-    k, mass = memory.load(plane, pieces, n, present)
-    value = memory.output_at(plane, below, offset, terms, u, present, k, mass)
-    return invert(operator, shape, ends, (left, height, pieces[2], n, mass, present), u, value, target)
+    curve, value = _loaded(operator, start, u)
+    return invert(operator, shape, ends, curve, u, value, target)
+
+
+@kernel
+def walk_state(
+    operator: Operator,
+    shape: Shape,
+    ends: Ends,
+    start: memory.Start,
+    u: float,
+    target: float,
+    direction: int,
+) -> tuple[float, float]:
+    """Return where the output has come to a target in one direction, or comes closest, and the error there."""
+    curve, value = _loaded(operator, start, u)
+    if direction * (target - value) <= 0.0:
+        return u, 0.0
+    end = ends[1] if direction > 0 else ends[0]
+    found, error, _ = walk(operator, shape[0], ends[2], end, curve, u, value, target, -math.inf, direction)
+    return found, error
 
 
 @kernel

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,18 +23,6 @@ from bench.models.streams.stream import PreisachStream
 
 if TYPE_CHECKING:
     from bench.models.inverses.inverse import Inverse, Policy
-
-
-class Segment(NamedTuple):
-    """One quadratic piece of a monotone move: output(u ± d) - output(u) = quadratic d² + linear d.
-
-    It holds for 0 <= d <= length: up to the next level, the next corner of the memory curve, the next
-    breakpoint of the reversible part or the end of the operating range (Zhang et al. 2013, eqs. 13 to 17).
-    """
-
-    length: float
-    quadratic: float
-    linear: float
 
 
 @dataclass(frozen=True)
@@ -235,22 +223,6 @@ class Preisach(Operator[MemoryCurve]):
     def stream(self, state: MemoryCurve | None = None) -> PreisachStream:
         """Return the operator with a memory of its own, compiled; see `Operator.stream`."""
         return PreisachStream(self, self.initial_state() if state is None else state)
-
-    def segment(self, state: MemoryCurve, direction: Literal[-1, 1]) -> Segment | None:
-        """Return the exact quadratic that the output follows from `state` upwards (1) or downwards (-1).
-
-        None at the end of the operating range. Zhang et al. 2013, eqs. 13, 16 and 17. Raises ValueError if
-        `direction` is neither -1 nor 1.
-        """
-        from bench.models.kernels import memory_kernels as _kernels
-
-        if direction not in (-1, 1):
-            raise ValueError(f"direction: expected -1 or 1, got {direction!r}")
-        t = self.lattice
-        left, height, _ = self._pieces(state)
-        ends = self.input_range
-        found = Segment(*_kernels.segment(t.plane, t.terms, *ends, left, height, state.input, direction))
-        return found if found.length > 0.0 else None
 
     def regressor(self, inputs: ArrayLike, state: MemoryCurve | None = None) -> Regressor:
         """Return the matrix of s = 2 on-area - area per cell, then the reversible part's columns.

@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 from bench.control import Spans, modulated_sine, tracking_targets, tuned, widened
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
-from bench.control.latched import Latched, LatchParameters, reversible_slope, walk
+from bench.control.latched import Latched, LatchParameters, reversible_slope
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.models import MemoryCurve, Polynomial, Preisach, PreisachInverse, Reach, uniform_levels
 
@@ -585,7 +585,7 @@ class TestLatched:
     )
     def test_walk_finds_the_first_input(self, models, inputs, target, direction):
         state = models.film.initial_state().advance(inputs)
-        found = walk(models.film, state, direction, target)
+        found = PreisachInverse(models.film).first_input(state, target, direction)
         end = LOW if direction < 0 else HIGH
         last = end if found is None else found
         path = np.linspace(state.input, last, 2000)
