@@ -9,16 +9,16 @@ from numba import carray  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
 from bench.base import inlined, kernel
-from bench.models.kernels import element_kernels as sequences
+from bench.models.kernels import element_kernels as sequences, memory_kernels as memory
 from bench.models.kernels.stream_kernels import pointer
 
 Floats = NDArray[np.float64]
 Words = NDArray[np.int64]
 
-# Words: addresses of the arrays, the last two of the operator's own, and the number of elements.
+# Words: addresses of the arrays, the last four of the operator's own, and the number of elements.
 # Derivation: the count is that of the names.
-NUMBERS, ELEMENTS, WEIGHTS, FIRST, SECOND, COUNT = range(6)
-WORD_COUNT = 6
+NUMBERS, ELEMENTS, WEIGHTS, FIRST, SECOND, THIRD, FOURTH, COUNT = range(8)
+WORD_COUNT = 8
 # Numbers: the present input, the output there, the bias, and those of the operator.
 # Derivation: the count is that of the names, and eleven of the largest operator.
 PRESENT, OUTPUT, BIAS, OWN = range(4)
@@ -110,6 +110,31 @@ def plays(address: int, value: float) -> float:
     lower, upper = _one(_envelope(numbers, OWN + 2, x)), _one(_envelope(numbers, OWN + 6, x))
     row = sequences.generalized_plays(lower, upper, _array(words, FIRST, elements.size), elements)[0]
     return _moved(numbers, value, _sum(words, row))
+
+
+@inlined
+def _mapped(x: float, words: Words, place: int, count: int) -> float:
+    """Return a map of dead zones at x, by its thresholds, intercepts and slopes; without one, of -1, x itself."""
+    if count < 0:
+        return x
+    parts = _array(words, place, 3 * count + 2)
+    k = 0
+    while k < count and x > parts[k]:
+        k += 1
+    mapped: float = parts[count + k] + parts[2 * count + 1 + k] * x
+    return mapped
+
+
+@kernel
+def weighted_plays(address: int, value: float) -> float:
+    """Step plays between two maps; thresholds, weights and lines of the maps; the origin, and sizes of the maps."""
+    if not math.isfinite(value):
+        return math.nan
+    words, numbers, elements = _opened(address)
+    x = _one(_mapped(value - numbers[OWN], words, THIRD, int(numbers[OWN + 1])))
+    thresholds, weights = _array(words, FIRST, elements.size), _array(words, SECOND, elements.size)
+    total = memory.weighted_plays(x, thresholds, weights, elements)[0]
+    return _moved(numbers, value, _mapped(total, words, FOURTH, int(numbers[OWN + 2])))
 
 
 @kernel

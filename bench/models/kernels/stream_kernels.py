@@ -36,13 +36,6 @@ INVERSE_STEP, OFFSET, INPUT, PRESENT, MASS, OUTPUT = range(6)
 LOW, HIGH, TOLERANCE, FIRST, LAST, ERROR = range(6, 12)
 NUMBER_COUNT = 12
 
-# Words of a stream of plays. The single-valued maps: number of thresholds, -1 for none, and address of thresholds,
-# intercepts and slopes, one behind the other. Derivation: the counts are those of the names.
-PLAY_NUMBERS, THRESHOLDS, WEIGHTS, PLAYS, PLAY_COUNT, BEFORE, BEFORE_COUNT, AFTER, AFTER_COUNT = range(9)
-PLAY_WORD_COUNT = 9
-ORIGIN, BIAS, PLAY_OUTPUT = range(3)
-PLAY_NUMBER_COUNT = 3
-
 Step = Callable[[int, float], float]
 
 
@@ -202,38 +195,3 @@ def follow(address: int, target: float) -> float:
         _move(words, numbers, plane, first)
     _move(words, numbers, plane, last)
     return last
-
-
-@inlined
-def _mapped(x: float, lines: int, count: int) -> float:
-    """Return a map of dead zones at x, see `DeadZones.value`; without one x itself."""
-    if count < 0:
-        return x
-    parts = carray(pointer(lines), 3 * count + 2, np.float64)
-    k = 0
-    while k < count and x > parts[k]:
-        k += 1
-    mapped: float = parts[count + k] + parts[2 * count + 1 + k] * x
-    return mapped
-
-
-@kernel
-def step_plays(address: int, value: float) -> float:
-    """Move the plays to an input and return the output; nan, without a move, if the input is not finite."""
-    words = carray(pointer(address), PLAY_WORD_COUNT, np.int64)
-    if not math.isfinite(value):
-        return math.nan
-    numbers = carray(pointer(words[PLAY_NUMBERS]), PLAY_NUMBER_COUNT, np.float64)
-    size = words[PLAY_COUNT]
-    thresholds = carray(pointer(words[THRESHOLDS]), size, np.float64)
-    weights = carray(pointer(words[WEIGHTS]), size, np.float64)
-    states = carray(pointer(words[PLAYS]), size, np.float64)
-    x = _mapped(value - numbers[ORIGIN], words[BEFORE], words[BEFORE_COUNT])
-    total = 0.0
-    for i in range(size):
-        z = max(x - thresholds[i], min(x + thresholds[i], states[i]))
-        total += weights[i] * z
-        states[i] = z
-    output: float = numbers[BIAS] + _mapped(total, words[AFTER], words[AFTER_COUNT])
-    numbers[PLAY_OUTPUT] = output
-    return output

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Operator
 from bench.models.regressor import Regressor
-from bench.models.streams.stream import AddressedStream, Stream, address_of
+from bench.models.streams.stream import Stream, address_of, compiled_step
 
 if TYPE_CHECKING:
-    from bench.models.kernels.stream_kernels import Step
+    from bench.models.operators.prandtl_ishlinskii import PrandtlIshlinskii
 
 ElementState: TypeAlias = tuple[float, ...]
 """The present input, then what each element remembers."""
@@ -31,7 +31,7 @@ class CompiledStep(NamedTuple):
 
     name: str  # the step, of `_element_stream_kernels`
     numbers: tuple[float, ...]  # the operator's numbers, in the order in which the step takes them
-    arrays: tuple[Floats, ...] = ()  # its arrays, likewise; at most two
+    arrays: tuple[Floats, ...] = ()  # its arrays, likewise; at most four
 
 
 class ElementOperator(Operator[ElementState]):
@@ -133,18 +133,19 @@ class ElementOperator(Operator[ElementState]):
         return True if (values >= 0.0).all() else False if (values <= 0.0).all() else None
 
 
-class ElementStream(AddressedStream[ElementState]):
-    """An operator of elements, changed in place; equal to `ElementOperator.step` but for the rounding of a sum."""
+class ElementStream(Stream[ElementState]):
+    """An operator of elements, changed in place; equal to `ElementOperator.step` but for the rounding of a sum.
 
-    operator: ElementOperator
+    The compiled step takes the address of the numbers, and returns nan where the input is not finite.
+    """
 
-    def __init__(self, operator: ElementOperator, state: ElementState) -> None:
+    def __init__(self, operator: ElementOperator | PrandtlIshlinskii, state: ElementState) -> None:
         from bench.models.kernels import element_stream_kernels as kernels
 
         step = operator.compiled_step()
         assert step is not None
         self.operator = operator
-        self._step = _compiled(step.name)
+        self._step = compiled_step(step.name, "element_stream_kernels")
         self._places = kernels
         present, self._elements = operator._split(state)
         self._numbers = np.zeros(kernels.NUMBER_COUNT)
@@ -158,6 +159,13 @@ class ElementStream(AddressedStream[ElementState]):
         self._words[kernels.COUNT] = self._elements.size
         self._address = address_of(self._words)
 
+    def step(self, value: float) -> float:
+        """Move the input monotonically to `value` and return the output; see `Stream.step`."""
+        output = self._step(self._address, value)
+        if output != output and not math.isfinite(value):
+            raise ValueError(f"value: expected a finite number, got {value}")
+        return output
+
     @property
     def value(self) -> float:
         """Present output, output units."""
@@ -167,11 +175,3 @@ class ElementStream(AddressedStream[ElementState]):
     def state(self) -> ElementState:
         """Present input and elements, as a value."""
         return (self._numbers.item(self._places.PRESENT), *self._elements.tolist())
-
-
-@cache
-def _compiled(name: str) -> Step:
-    from bench.models.kernels import element_stream_kernels as kernels
-
-    step: Step = getattr(kernels, name).prepare()
-    return step

@@ -7,25 +7,20 @@ continued by its tangent at the end.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats, checks as _checks
-from bench.models.operator import Operator
+from bench.models.operators.elements import ElementOperator, ElementState
 from bench.models.operators.polynomial import chebyshev_terms
-from bench.models.regressor import Regressor
-
-State: TypeAlias = tuple[float, ...]
-"""The input, then the output of each play."""
 
 
 @dataclass(frozen=True, eq=False)
-class PolynomialPlays(Operator[State]):
-    """A Chebyshev series of the input, and one of each play.
+class PolynomialPlays(ElementOperator):
+    """A Chebyshev series of the input, and one of each play. The state is the input and the plays.
 
     Parameters
     ----------
@@ -92,13 +87,14 @@ class PolynomialPlays(Operator[State]):
         weights, series = np.split(self._coefficients(coefficients), [self.weights.size])
         return replace(self, weights=weights, series=series, bias=bias)
 
-    def initial_state(self) -> State:
-        """Return the relaxed state; that of negative saturation if the operator has no origin."""
-        if self.origin is None:
-            return self.saturated_state(-1)
-        return (self.origin,) * (self.thresholds.size + 1)
+    def at_rest(self) -> tuple[float, Floats]:
+        """Return the origin, at which all plays stand; without one the low end in negative saturation."""
+        if self.origin is not None:
+            return self.origin, np.full(self.thresholds.size, self.origin)
+        low = self.input_range[0]
+        return low, low + self.thresholds
 
-    def saturated_state(self, direction: int, value: float | None = None) -> State:
+    def saturated_state(self, direction: int, value: float | None = None) -> ElementState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.
 
         Raises ValueError if `direction` is neither -1 nor 1.
@@ -107,46 +103,19 @@ class PolynomialPlays(Operator[State]):
         at = end if value is None else value
         return (at, *(at - direction * self.thresholds).tolist())
 
-    def present_input(self, state: State) -> float:
-        """Return the input of a state."""
-        return state[0]
-
-    def _plays(self, sequence: Floats, state: State | None) -> Floats:
+    def respond(self, inputs: Floats, present: float, elements: Floats) -> Floats:  # noqa: ARG002
+        """Return the columns of the plays, of T2 and so on of the plays, and of T1 to Tn of the input."""
         from bench.models.kernels import memory_kernels as _kernels
 
-        before = np.array((self.initial_state() if state is None else state)[1:], dtype=np.float64)
-        if before.size != self.thresholds.size:
-            raise ValueError(f"state: expected {self.thresholds.size} plays after the input, got {before.size}")
-        return np.asarray(_kernels.plays(sequence, self.thresholds, before))
-
-    def regressor(self, inputs: ArrayLike, state: State | None = None) -> Regressor:
-        """Return the columns of the plays, of T2 and so on of the plays, and of T1 to Tn of the input."""
-        sequence = _checks.samples("inputs", inputs)
         low, high = self.input_range
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        plays = self._plays(sequence, state)
+        plays = np.asarray(_kernels.plays(inputs, self.thresholds, elements))
         columns = [plays]
         if self.powers > 1:
             series = chebyshev_terms((plays - middle) / (half - self.thresholds), self.powers)
             columns += [series[..., power] for power in range(1, self.powers)]
-        columns.append(chebyshev_terms((sequence - middle) / half, self.series.size))
-        return Regressor.of_columns(np.column_stack(columns))
-
-    def evaluate(self, inputs: ArrayLike, state: State | None = None) -> Floats:
-        """Return the outputs of a sequence, shape (N,), from `state` (default: negative saturation)."""
-        return self.bias + self.regressor(inputs, state).extra @ self.coefficients
-
-    def advance(self, state: State, inputs: ArrayLike) -> State:
-        """Return the state after a sequence of inputs, shape (N,)."""
-        sequence = _checks.samples("inputs", inputs)
-        return (float(sequence[-1]), *self._plays(sequence, state)[-1].tolist())
-
-    def step(self, state: State, value: float) -> tuple[State, float]:
-        """Return state and output after the input moved monotonically to `value`."""
-        if not math.isfinite(value):
-            raise ValueError(f"value: expected a finite number, got {value}")
-        after = self.advance(state, [value])
-        return after, float(self.evaluate([value], state)[0])
+        columns.append(chebyshev_terms((inputs - middle) / half, self.series.size))
+        return np.column_stack(columns)
 
     def nonnegative(self) -> NDArray[np.bool_]:
         """Return False for each coefficient: their signs are free."""

@@ -23,8 +23,7 @@ from bench.models.density import Density
 from bench.models.documents import Model, Parts
 from bench.models.operator import Operator, operator_from_json
 from bench.models.operators.polynomial import Polynomial
-from bench.models.operators.two_stage_state import TwoStageState
-from bench.models.streams.coupled_stream import CoupledStream, TwoStageStream
+from bench.models.streams.coupled_stream import CoupledStream, TwoStageState, TwoStageStream
 
 S = TypeVar("S")
 Stage: TypeAlias = Operator[Any]
@@ -174,12 +173,9 @@ class TwoStage(Coupled[TwoStageState]):
 
         With `together` u moves straight to its new value, otherwise with the force first.
         """
-        tension = _checks.number("force", force)
-        second = state.second
-        if not together and tension != state.force:
-            second, _ = self.second.step(second, tension - state.blocked)
-        first, blocked = self._driven(state, voltage)
-        return self._arrived(voltage, tension, first, second, blocked, tension - blocked)
+        stream = self.stream(state)
+        length = stream.step(voltage, force, together=together)
+        return stream.state, length
 
     def stream(self, state: TwoStageState | None = None) -> TwoStageStream:
         """Return the model with a memory of its own, of streams of its stages; see `Coupled.stream`."""
@@ -191,26 +187,9 @@ class TwoStage(Coupled[TwoStageState]):
         With `argument` = `state.argument` the length is held and the force is H1[voltage] + u. Raises ValueError if a
         number is not finite.
         """
-        u = _checks.number("argument", argument)
-        first, blocked = self._driven(state, voltage)
-        return self._arrived(voltage, u + blocked, first, state.second, blocked, u)
-
-    def _driven(self, state: TwoStageState, voltage: float) -> tuple[Any, float]:
-        if _checks.number("voltage", voltage) == state.voltage:
-            return state.first, state.blocked
-        return self.first.step(state.first, voltage)
-
-    def _arrived(
-        self,
-        voltage: float,
-        force: float,
-        first: Any,  # noqa: ANN401 - each operator has its own state
-        second: Any,  # noqa: ANN401
-        blocked: float,
-        argument: float,
-    ) -> tuple[TwoStageState, float]:
-        after, length = self.second.step(second, argument)
-        return TwoStageState(float(voltage), force, first, after, blocked, argument, length), length
+        stream = self.stream(state)
+        length = stream.move(voltage, argument)
+        return stream.state, length
 
     def arguments(
         self, voltages: ArrayLike, forces: ArrayLike, state: TwoStageState | None = None, *, together: bool = False
@@ -242,8 +221,9 @@ class TwoStage(Coupled[TwoStageState]):
         path = _interleaved(blocked, f, together)
         first = _advanced(self.first, before.first, v)
         # The last step is taken singly: it gives the length.
-        second = _advanced(self.second, before.second, path[:-1])
-        return self._arrived(float(v[-1]), float(f[-1]), first, second, float(blocked[-1]), float(path[-1]))[0]
+        *_, argument = path.tolist()
+        second, length = self.second.step(_advanced(self.second, before.second, path[:-1]), argument)
+        return TwoStageState(float(v[-1]), float(f[-1]), first, second, float(blocked[-1]), argument, length)
 
 
 @dataclass(frozen=True, slots=True)

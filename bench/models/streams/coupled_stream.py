@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from bench.base import checks as _checks
-from bench.models.operators.two_stage_state import TwoStageState
 
 if TYPE_CHECKING:
     from bench.models.operators.two_stage import Coupled, TwoStage
@@ -36,6 +36,33 @@ class CoupledStream(Generic[S]):
     def __reduce__(self) -> tuple[type[Any], tuple[Any, Any]]:
         # A copy has arrays of its own.
         return type(self), (self.model, self.state)
+
+
+@dataclass(frozen=True, slots=True)
+class TwoStageState:
+    """The memories of both stages and where they are now.
+
+    Parameters
+    ----------
+    voltage, force : float
+        Present inputs.
+    first, second : object
+        States of the two operators.
+    blocked : float
+        Output of the first stage, the force at resting length, force units.
+    argument : float
+        Input of the second stage, force - blocked.
+    length : float
+        Output of the second stage, length units.
+    """
+
+    voltage: float
+    force: float
+    first: Any
+    second: Any
+    blocked: float
+    argument: float
+    length: float
 
 
 class TwoStageStream(CoupledStream[TwoStageState]):

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 
-from bench.base import Floats
 from bench.models.memory import MemoryCurve, trusted_curve
 
 if TYPE_CHECKING:
     from bench.models.kernels.stream_kernels import Step
     from bench.models.operator import Operator
-    from bench.models.operators.prandtl_ishlinskii import DeadZones, PlayState, PrandtlIshlinskii
     from bench.models.operators.preisach import Preisach
 
 S = TypeVar("S")
@@ -160,71 +159,10 @@ class PreisachStream(Stream[MemoryCurve]):
         return trusted_curve(tuple(extrema.tolist()), self._numbers.item(kernels.INPUT), saturation)
 
 
-class AddressedStream(Stream[S]):
-    """A stream whose compiled step takes the address of its numbers; it returns nan where the input is not finite."""
-
-    _step: Step
-    _address: int
-
-    def step(self, value: float) -> float:
-        """Move the input monotonically to `value` and return the output; see `Stream.step`."""
-        output = self._step(self._address, value)
-        if output != output and not math.isfinite(value):
-            raise ValueError(f"value: expected a finite number, got {value}")
-        return output
-
-
-class PlayStream(AddressedStream["PlayState"]):
-    """A Prandtl-Ishlinskii operator and its plays on arrays; equal to `evaluate` to the last bit."""
-
-    operator: PrandtlIshlinskii
-
-    def __init__(self, operator: PrandtlIshlinskii, state: PlayState) -> None:
-        from bench.models.kernels import stream_kernels as kernels
-
-        self.operator = operator
-        self._step = compiled_step("step_plays")
-        self._output_place = kernels.PLAY_OUTPUT
-        self._words = words = np.zeros(kernels.PLAY_WORD_COUNT, dtype=np.int64)
-        self._numbers = numbers = np.zeros(kernels.PLAY_NUMBER_COUNT)
-        self._plays = np.array(state, dtype=np.float64)
-        before, after = _lines(operator.before), _lines(operator.after)
-        # Kept for their addresses.
-        self._tables = {
-            kernels.PLAY_NUMBERS: numbers,
-            kernels.THRESHOLDS: operator.thresholds,
-            kernels.WEIGHTS: operator.weights,
-            kernels.PLAYS: self._plays,
-            kernels.BEFORE: before,
-            kernels.AFTER: after,
-        }
-        for place, table in self._tables.items():
-            words[place] = address_of(table)
-        words[kernels.PLAY_COUNT] = operator.thresholds.size
-        words[kernels.BEFORE_COUNT] = (before.size - 2) // 3 if before.size else -1
-        words[kernels.AFTER_COUNT] = (after.size - 2) // 3 if after.size else -1
-        numbers[kernels.ORIGIN] = operator.origin
-        numbers[kernels.BIAS] = operator.bias
-        numbers[kernels.PLAY_OUTPUT] = operator.value(state)
-        self._address = address_of(words)
-
-    @property
-    def value(self) -> float:
-        """Present output, output units."""
-        return self._numbers.item(self._output_place)
-
-    @property
-    def state(self) -> PlayState:
-        """Present play states, as a value."""
-        return tuple(self._plays.tolist())
-
-
 @cache
-def compiled_step(name: str) -> Step:
-    """Return a compiled step of `_stream_kernels` as a plain function of address and number."""
-    from bench.models.kernels import stream_kernels as kernels
-
-    step: Step = getattr(kernels, name).prepare()
+def compiled_step(name: str, module: str = "stream_kernels") -> Step:
+    """Return a compiled step of a module of kernels as a plain function of address and number."""
+    step: Step = getattr(import_module(f"bench.models.kernels.{module}"), name).prepare()
     return step
 
 
@@ -233,8 +171,3 @@ def address_of(array: np.ndarray[Any, Any]) -> int:
     if not array.flags.c_contiguous:
         raise ValueError("array: expected a contiguous one")
     return array.ctypes.data
-
-
-def _lines(zones: DeadZones | None) -> Floats:
-    """Return thresholds, intercepts and slopes of a map one behind the other; empty without one."""
-    return np.empty(0) if zones is None else np.concatenate(zones.lines)

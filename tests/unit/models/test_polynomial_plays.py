@@ -45,7 +45,7 @@ def test_wrong_parts_are_named(change, message):
 
 
 def test_a_state_of_another_operator_is_refused():
-    with pytest.raises(ValueError, match="state: expected 2 plays"):
+    with pytest.raises(ValueError, match="state: expected 3 numbers"):
         MODEL.evaluate(INPUTS, (0.0, 1.0))
     with pytest.raises(ValueError, match="coefficients: expected 4"):
         MODEL.with_coefficients([1.0], 0.0)
