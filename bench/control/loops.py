@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.control.tracking import Command, Follower, Trace
+from bench.control.tracking import Command, Follower, TargetController, Trace
 
 Floats = NDArray[np.float64]
 
@@ -109,35 +109,18 @@ class Playback:
             out[k] = self.update(t, ())
 
 
-class Reaching(Protocol):
-    """A controller that is aimed at one target after another, such as a `TargetController`.
-
-    Both calls take time, measured input and output, and the further signals that the controller needs, if any; `aim`
-    takes the target before them.
-    """
-
-    @property
-    def aim(self) -> Callable[..., Command]: ...  # noqa: D102
-
-    @property
-    def update(self) -> Callable[..., Command]: ...  # noqa: D102
-
-    @property
-    def trace(self) -> Trace: ...  # noqa: D102
-
-
 class ReachTarget:
     """Bring the output to one target.
 
     Parameters
     ----------
-    controller : Reaching
+    controller : TargetController
         Keeps its state from one target to the next.
     target : float
         Output units.
     """
 
-    def __init__(self, controller: Reaching, target: float) -> None:
+    def __init__(self, controller: TargetController, target: float) -> None:
         self._controller = controller
         self._target = target
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from bench.base import ConvergenceError, Floats
 from bench.control.convergence import SWINGS_OF_A_TARGET, LimitCycleWatch
-from bench.control.loops import Foreseeing, Reaching
+from bench.control.loops import Foreseeing
 from bench.control.model_filters import ModelFilter
-from bench.control.tracking import Command, Follower, Trace
+from bench.control.tracking import Command, Follower, TargetController, Trace
 from bench.models import Reach
 
 
@@ -70,7 +70,7 @@ class _Supervision:
 
     def __init__(
         self,
-        controller: Any,  # noqa: ANN401 - `Reaching` or `Follower`
+        controller: Any,  # noqa: ANN401 - `TargetController` or `Follower`
         rules: Rules,
         fallback: Callable[[Any], Any] | None = None,
     ) -> None:
@@ -166,7 +166,7 @@ class _Supervision:
 
 
 class Supervised(_Supervision):
-    """A target controller that is given up when it does not converge: a `Reaching`.
+    """A target controller that is given up when it does not converge: a `TargetController`.
 
     It is by the rules; if it sends the actuator to and fro between the ends of its range at one target; or if it says
     so itself (`doubt`). Targets that cannot be met do not count; one that is missed by more than what would be within
@@ -176,10 +176,10 @@ class Supervised(_Supervision):
 
     def __init__(
         self,
-        controller: Reaching,
+        controller: TargetController,
         limits: tuple[float, float],
         rules: Rules,
-        fallback: Callable[[Any], Reaching] | None = None,
+        fallback: Callable[[Any], TargetController] | None = None,
     ) -> None:
         super().__init__(controller, rules, fallback)
         self._limits = limits
@@ -188,14 +188,14 @@ class Supervised(_Supervision):
         self._finished = False
 
     def aim(self, target: float, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Aim at the next target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
+        """Aim at the next target; see `TargetController`. Raises ConvergenceError if it does not converge."""
         self._judge_target()
         self._target, self._output, self._finished = target, output, False
         command: Command = self._controller.aim(target, t, measured_input, output, *others)
         return self._watched(command, t, measured_input, output, others)
 
     def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Go on towards the target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
+        """Go on towards the target; see `TargetController`. Raises ConvergenceError if it does not converge."""
         if math.isfinite(output):
             self._output = output
         command: Command = self._controller.update(t, measured_input, output, *others)

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
@@ -137,15 +137,18 @@ class Controller(Protocol):
 class TargetController(Controller, Protocol):
     """Brings the output to one target after another.
 
-    `aim` and `update` take the time in s, the measured input in input units and one reading of the output.
+    `aim` and `update` take the time in s, the measured input in input units, one reading of the output, and the
+    further signals that the controller needs, if any; `aim` takes the target before them.
     """
 
-    def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
-        """Start towards a new target and return the first command."""
+    @property
+    def aim(self) -> Callable[..., Command]:
+        """What starts towards a new target and returns the first command."""
         ...
 
-    def update(self, t: float, measured_input: float, output: float) -> Command:
-        """Take in a reading, `Command.wait` after the last or later, and return the next command."""
+    @property
+    def update(self) -> Callable[..., Command]:
+        """What takes in a reading, `Command.wait` after the last or later, and returns the next command."""
         ...
 
 
