@@ -46,6 +46,8 @@ SetShiftDecimal SetShiftFraction
 """
 _UNUSED = [f"{way}{kind}" for kind in _KINDS for way in ("Get", "Set")] + _OTHERS.split()
 """Functions of FMI 3.0 that a unit for co-simulation without events has, and that do nothing."""
+_TIME = '    <Float64 name="time" valueReference="6" causality="independent" variability="continuous"/>'
+"""The variable that version 3.0 has beside those of the model."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +121,10 @@ def write_fmu(
         f"{fmi}.c": rendered(template["head"] + template[fmi], "double", found.name, found.name, words)
     }
     binary = "binaries/linux64" if version == "2.0" else "binaries/x86_64-linux"
-    described = {"2.0": _description2, "3.0": _description3}[version]
     content = {f"sources/{name}": text.encode() for name, text in files.items()}
-    content["modelDescription.xml"] = described(file, found.digest, variables, period, sorted(files)).encode()
+    content["modelDescription.xml"] = _description(
+        version, file, found.digest, variables, period, sorted(files)
+    ).encode()
     content["documentation/README.md"] = found.files["README.md"].encode()
     if version == "3.0":
         content["sources/buildDescription.xml"] = _build_description(sorted(files)).encode()
@@ -223,97 +226,68 @@ def _attributes(**values: object) -> str:
     )
 
 
-def _tool() -> str:
-    return f"actuator-bench {importlib.metadata.version('actuator-bench')}"
-
-
-def _description2(
-    file: ModelFile, guid: str, variables: list[_Variable], period: float | None, sources: list[str]
-) -> str:
-    units = sorted({each.unit for each in variables if each.unit})
-    lines, outputs = [], []
-    for index, each in enumerate(variables, start=1):
-        initial = {"parameter": "exact", "output": "calculated"}.get(each.causality)
-        variability = "fixed" if each.causality == "parameter" else "discrete"
-        head = _attributes(
-            name=each.name, valueReference=each.reference, causality=each.causality, variability=variability,
-            initial=initial,
-        )  # fmt: skip
-        kind = "Integer" if each.whole else "Real"
-        lines.append(
-            f"    <ScalarVariable {head}><{kind} {_attributes(unit=each.unit, start=each.start)}/></ScalarVariable>"
-        )
-        if each.causality == "output":
-            outputs.append(index)
-    unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
-    abilities = _attributes(
-        modelIdentifier="model", canHandleVariableCommunicationStepSize=period is None,
-        canGetAndSetFMUstate=True, canSerializeFMUstate=True,
-    )  # fmt: skip
-    head = _attributes(
-        fmiVersion="2.0", modelName=file.name, guid=guid, generationTool=_tool(), variableNamingConvention="flat"
-    )
-    unit_lines = "".join(f"<Unit name={quoteattr(unit)}/>" for unit in units)
-    return "\n".join(
-        [
-            '<?xml version="1.0" encoding="UTF-8"?>',
-            f"<fmiModelDescription {head}>",
-            f"  <CoSimulation {abilities}><SourceFiles>"
-            + "".join(f'<File name="{name}"/>' for name in sources if name.endswith(".c"))
-            + "</SourceFiles></CoSimulation>",
-            *([f"  <UnitDefinitions>{unit_lines}</UnitDefinitions>"] if units else []),
-            f'  <DefaultExperiment startTime="0" stopTime="1" stepSize="{period or 0.01!r}"/>',
-            "  <ModelVariables>",
-            *lines,
-            "  </ModelVariables>",
-            f"  <ModelStructure><Outputs>{unknowns}</Outputs><InitialUnknowns>{unknowns}</InitialUnknowns>"
-            "</ModelStructure>",
-            "</fmiModelDescription>",
-            "",
-        ]
-    )
-
-
-def _description3(
+def _description(
+    version: Version,
     file: ModelFile,
     guid: str,
     variables: list[_Variable],
     period: float | None,
-    sources: list[str],  # noqa: ARG001 - named in a file of their own
+    sources: list[str],
 ) -> str:
+    """Return the model description; version 3 names the sources in a file of their own."""
+    is_old = version == "2.0"
     units = sorted({each.unit for each in variables if each.unit})
-    lines = ['    <Float64 name="time" valueReference="6" causality="independent" variability="continuous"/>']
-    for each in variables:
-        initial = {"parameter": "exact", "output": "calculated"}.get(each.causality)
-        variability = "fixed" if each.causality == "parameter" else "discrete"
-        attributes = _attributes(
-            name=each.name, valueReference=each.reference, causality=each.causality, variability=variability,
-            initial=initial, unit=each.unit, start=each.start,
-        )  # fmt: skip
-        lines.append(f"    <{'Int32' if each.whole else 'Float64'} {attributes}/>")
-    outputs = [each.reference for each in variables if each.causality == "output"]
-    abilities = _attributes(
-        modelIdentifier="model", canHandleVariableCommunicationStepSize=period is None,
-        canGetAndSetFMUState=True, canSerializeFMUState=True,
-    )  # fmt: skip
-    head = _attributes(
-        fmiVersion="3.0", modelName=file.name, instantiationToken=guid, generationTool=_tool(),
-        variableNamingConvention="flat",
-    )  # fmt: skip
     unit_lines = "".join(f"<Unit name={quoteattr(unit)}/>" for unit in units)
+    lines = [] if is_old else [_TIME]
+    for each in variables:
+        is_parameter = each.causality == "parameter"
+        attributes = _attributes(
+            name=each.name, valueReference=each.reference, causality=each.causality,
+            variability="fixed" if is_parameter else "discrete",
+            initial={"parameter": "exact", "output": "calculated"}.get(each.causality),
+        )  # fmt: skip
+        own = _attributes(unit=each.unit, start=each.start)
+        if is_old:
+            kind = "Integer" if each.whole else "Real"
+            lines.append(f"    <ScalarVariable {attributes}><{kind} {own}/></ScalarVariable>")
+        else:
+            lines.append(f"    <{'Int32' if each.whole else 'Float64'} {attributes} {own}".rstrip() + "/>")
+    # By their places in version 2, by their references in version 3.
+    outputs = [i if is_old else v.reference for i, v in enumerate(variables, start=1) if v.causality == "output"]
+    if is_old:
+        unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
+        structure = [f"    <Outputs>{unknowns}</Outputs><InitialUnknowns>{unknowns}</InitialUnknowns>"]
+    else:
+        structure = [f'    <{k} valueReference="{r}"/>' for k in ("Output", "InitialUnknown") for r in outputs]
+    saved = "canGetAndSetFMUstate" if is_old else "canGetAndSetFMUState"
+    serialized = "canSerializeFMUstate" if is_old else "canSerializeFMUState"
+    abilities = _attributes(
+        modelIdentifier="model",
+        canHandleVariableCommunicationStepSize=period is None,
+        **{saved: True, serialized: True},
+    )
+    listed = "".join(f'<File name="{name}"/>' for name in sources if name.endswith(".c"))
+    head = _attributes(
+        fmiVersion=version,
+        modelName=file.name,
+        **{"guid" if is_old else "instantiationToken": guid},
+        generationTool=f"actuator-bench {importlib.metadata.version('actuator-bench')}",
+        variableNamingConvention="flat",
+    )
     return "\n".join(
         [
             '<?xml version="1.0" encoding="UTF-8"?>',
             f"<fmiModelDescription {head}>",
-            f"  <CoSimulation {abilities}/>",
+            f"  <CoSimulation {abilities}>"
+            + (f"<SourceFiles>{listed}</SourceFiles>" if is_old else "")
+            + "</CoSimulation>",
             *([f"  <UnitDefinitions>{unit_lines}</UnitDefinitions>"] if units else []),
             f'  <DefaultExperiment startTime="0" stopTime="1" stepSize="{period or 0.01!r}"/>',
             "  <ModelVariables>",
             *lines,
             "  </ModelVariables>",
             "  <ModelStructure>",
-            *(f'    <Output valueReference="{reference}"/>' for reference in outputs),
-            *(f'    <InitialUnknown valueReference="{reference}"/>' for reference in outputs),
+            *structure,
             "  </ModelStructure>",
             "</fmiModelDescription>",
             "",
