@@ -297,8 +297,7 @@ def reshape(search: Search, found: Found, tolerance: float = 1e-10) -> tuple[Sea
         static = shaped(tuple(values[:count].tolist()))
         follows = search.linear(parameters, values[count:])
         responses = search.behind(follows, static.regressor.dense(), found.elements)
-        fitted = search.fit(responses, sign)
-        return static, fitted, search.roots * (search.static.outputs - responses.predict(fitted))
+        return static, *search.fit_and_rest(responses, sign)
 
     def residuals(values: Floats) -> Floats:
         return at(values)[2]

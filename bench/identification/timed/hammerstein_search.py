@@ -216,10 +216,16 @@ class Search:
         """Return parameters with the coefficients that belong to them, of the sign that fits better, and the cost."""
         responses, found = self.responses(elements, values), []
         for sign in self.signs:
-            fitted = self.fit(responses, sign, start=start)
-            rest = self.roots * (self.static.outputs - responses.predict(fitted))
+            fitted, rest = self.fit_and_rest(responses, sign, start)
             found.append(Found(elements, values, fitted, float(rest @ rest), deviations))
         return min(found, key=lambda each: each.cost)
+
+    def fit_and_rest(
+        self, responses: Responses, sign: Literal[1, -1], start: Fit | None = None
+    ) -> tuple[Fit, Floats]:
+        """Return the coefficients of responses, and the weighted residuals, shape (N,)."""
+        fitted = self.fit(responses, sign, start=start)
+        return fitted, self.roots * (self.static.outputs - responses.predict(fitted))
 
     def fit(
         self,
