@@ -103,6 +103,7 @@ from .inspection import (
 from .measures import (
     Comparison as Comparison,
     Errors as Errors,
+    autocorrelation as autocorrelation,
     measure_errors as measure_errors,
 )
 from .memory_tests import (

@@ -78,6 +78,12 @@ def measure_errors(measured: ArrayLike, predicted: ArrayLike) -> Errors:
     )
 
 
+def autocorrelation(residuals: Floats) -> float:
+    """Return the correlation of neighbouring residuals, shape (N,) or (N, n): 0 to 0.99, as 1 - it is divided by."""
+    total = float(np.sum(residuals**2))
+    return min(max(float(np.sum(residuals[1:] * residuals[:-1])) / total, 0.0), 0.99) if total > 0.0 else 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """How one model does on a measured sequence.

@@ -14,6 +14,8 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from bench.base import Floats, checks as _checks
+from bench.identification.fit.variable_projection import Evidence
+from bench.identification.measures import autocorrelation
 from bench.models import Operator, TimedSequence
 
 Kind: TypeAlias = Literal["offset", "gain", "drift", "input-offset"]
@@ -231,18 +233,13 @@ def _best_shift(operator: Operator[Any] | TimedSequence, solve: Any) -> float:  
 
 def _uncertainties(jacobian: Floats, residuals: Floats, names: list[Kind]) -> Floats:
     """Return standard uncertainties; raise ValueError if the columns are not independent."""
-    norms = np.linalg.norm(jacobian, axis=0)
+    evidence = Evidence.of(jacobian, residuals, residuals.size - len(names))
     apart = f"the rows do not tell {' and '.join(names)} apart"
-    if not (norms > 0.0).all():
+    if (lost := np.isinf(evidence.deviations)).any():
         raise ValueError(
-            f"{apart}: nothing depends on {names[int(np.argmin(norms))]}; use more rows, or fewer numbers"
+            f"{apart}: nothing depends on {names[int(np.argmax(lost))]}; use more rows, or fewer numbers"
         )
-    singular = np.linalg.svd(jacobian / norms, compute_uv=False)
-    if singular[0] > _WORST * singular[-1]:
-        raise ValueError(f"{apart} (condition {singular[0] / singular[-1]:.1g}); use more rows, or fewer numbers")
-    inverse = np.linalg.inv((jacobian / norms).T @ (jacobian / norms))
-    total = float(residuals @ residuals)
-    correlation = float(residuals[1:] @ residuals[:-1]) / total if total > 0.0 else 0.0
-    correlation = min(max(correlation, 0.0), 0.99)
-    variance = total / (residuals.size - len(names)) * (1.0 + correlation) / (1.0 - correlation)
-    return np.asarray(np.sqrt(variance * np.diag(inverse)) / norms)
+    if evidence.condition > _WORST:
+        raise ValueError(f"{apart} (condition {evidence.condition:.1g}); use more rows, or fewer numbers")
+    correlation = autocorrelation(residuals)
+    return np.asarray(evidence.deviations * np.sqrt((1.0 + correlation) / (1.0 - correlation)))

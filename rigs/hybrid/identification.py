@@ -25,7 +25,14 @@ from bench.analysis import (
     uncertain_signals,
 )
 from bench.base import ConfigurationError, DataError
-from bench.identification import DynamicsIdentification, Errors, Identification, ModelFile, identify_dynamics
+from bench.identification import (
+    DynamicsIdentification,
+    Errors,
+    Identification,
+    ModelFile,
+    autocorrelation,
+    identify_dynamics,
+)
 from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import LATENESS
 from bench.record import Record, Table
@@ -53,9 +60,6 @@ _UNITS = {
     **dict.fromkeys(("tec_resistance", "beam_resistance", "beam_side_resistance", "block_side_resistance"), "K/W"),
 }
 """Units of the fitted parameters of the network."""
-_MOST_ALIKE = 0.99
-"""Largest correlation of neighbouring residuals. Derivation: 100 samples then count as half a one, as in any fit that
-misses the model."""
 _DRIFT_PASSES = 64
 """Passes in which operator and parabola are fitted in turn; more change less than the sensor's noise."""
 
@@ -253,9 +257,8 @@ def network_uncertainty(steps: Path, found: NetworkIdentification) -> dict[str, 
     freedom = found.residuals.size - len(found.uncertainties)
     fitted = [name for name in found.uncertainties if name in _UNITS]
     # Residuals that are alike say less than as many that are not.
-    alike = max(float(np.sum(found.residuals[1:] * found.residuals[:-1]) / np.sum(found.residuals**2)), 0.0)
-    wider = math.sqrt((1.0 + alike) / (1.0 - min(alike, _MOST_ALIKE)))
-
+    alike = autocorrelation(found.residuals)
+    wider = math.sqrt((1.0 + alike) / (1.0 - alike))
     with Record(steps) as record:
         signals = uncertain_signals(record)
     nominal = {name: (float(getattr(found.network, name)), _UNITS[name]) for name in fitted}

@@ -9,6 +9,7 @@ import numpy as np
 
 from bench.base import Floats
 from bench.identification.fit.least_squares import one_thread
+from bench.identification.measures import autocorrelation
 from bench.models import Operator
 
 # An eigenvalue below this part of the greatest is no information. Derivation: the rounding of sums of thousands of
@@ -81,10 +82,8 @@ def coefficient_uncertainties(
         return CoefficientUncertainties(
             None, "no σ: the readings determine only sums of these coefficients, not each by itself"
         )
-    total = float(counted @ counted)
-    # At most 0.99, for the sake of what is divided by 1 - ρ.
-    correlation = min(max(float(counted[1:] @ counted[:-1]) / total, 0.0), 0.99) if total > 0.0 else 0.0
-    variance = total / spare * (1.0 + correlation) / (1.0 - correlation)
+    correlation = autocorrelation(counted)
+    variance = float(counted @ counted) / spare * (1.0 + correlation) / (1.0 - correlation)
     sigmas = np.zeros(coefficients.size)
     sigmas[free] = np.nan
     sigmas[free[known]] = np.sqrt(variance * ((vectors**2) / values).sum(axis=1)) / norms[known]
