@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.base import Floats, checks as _checks, counted
+from bench.base import Floats, checks as _checks
 
 _MINUS_INFINITY = -math.inf
 # Part of the range of inputs at its ends whose memory is as good as known.
@@ -171,25 +171,6 @@ class MemoryCurve:
         # A rising branch ends on the diagonal anyway.
         distinct = [vertex for n, vertex in enumerate(vertices) if n == 0 or vertex != vertices[n - 1]]
         return np.array(distinct, dtype=np.float64)
-
-    def describe(self, unit: str = "") -> str:
-        """Return the memory in words, for people: present branch, input, and the reversals it remembers."""
-        suffix = f" {unit}" if unit else ""
-        branch = "rising" if self.rising else "falling"
-        ends = {-1: "negative", 1: "positive"}
-        lines = [f"{branch} at {self.input:g}{suffix}, from {ends[self.saturation]} saturation"]
-        if not self.extrema:
-            lines.append("no reversal remembered: on a major branch")
-            return "\n".join(lines)
-        lines.append(f"{counted(len(self.extrema), 'reversal')} remembered, outermost first:")
-        maximum = self.saturation < 0
-        for value in self.extrema:
-            lines.append(f"  {'maximum' if maximum else 'minimum'} {value:g}{suffix}")
-            maximum = not maximum
-        if len(self.extrema) > 1:
-            last, before = self.extrema[-1], self.extrema[-2]
-            lines.append(f"the innermost loop closes at {before:g}{suffix}, {abs(before - last):g}{suffix} wide")
-        return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
         """Return the memory as a JSON object."""

@@ -87,11 +87,6 @@ class Regressor:
         """Samples and coefficients."""
         return self.extra.shape[0], self.base.size + self.extra.shape[1]
 
-    @property
-    def nbytes(self) -> int:
-        """Memory held, bytes."""
-        return self.base.nbytes + self.starts.nbytes + self.cells.nbytes + self.changes.nbytes + self.extra.nbytes
-
     def product(self, coefficients: ArrayLike) -> Floats:
         """Return R @ coefficients, shape (N,).
 

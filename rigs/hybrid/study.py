@@ -557,6 +557,7 @@ STUDY = Study(
     published=PUBLISHED,
     kernels=(
         "bench.identification.kernels.mode_kernels",
+        "bench.models.kernels.play_stream_kernels",
         "sim_devices.plants._hybrid_kernels",
         "sim_devices.plants._voltage_course_kernels",
         "sim_devices.transducers",

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.base import inlined, inner, kernel
+from bench.base import Fixed, inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 
@@ -30,18 +30,7 @@ _LIMIT = 1e6
 
 
 @kernel
-def generalized_plays(lower: Floats, upper: Floats, thresholds: Floats, state: Floats) -> Floats:
-    """Step plays between two drives; return their states sample by sample. `state` is changed."""
-    result = np.empty((lower.size, state.size))
-    for t in range(lower.size):
-        for i in range(state.size):
-            state[i] = max(lower[t] - thresholds[i], min(upper[t] + thresholds[i], state[i]))
-            result[t, i] = state[i]
-    return result
-
-
-@kernel
-def stops(inputs: Floats, present: float, limits: Floats, state: Floats) -> Floats:
+def stops(inputs: Floats, present: float, limits: Fixed, state: Floats) -> Floats:
     """Step stops through `inputs`; return their states sample by sample. `state` is changed."""
     result = np.empty((inputs.size, state.size))
     for t in range(inputs.size):

@@ -26,7 +26,7 @@ NUMBER_COUNT = 14
 
 
 @inlined
-def _opened(address: int) -> tuple[Words, Floats, Floats]:
+def opened(address: int) -> tuple[Words, Floats, Floats]:
     """Return words, numbers and elements."""
     words = carray(pointer(address), WORD_COUNT, np.int64)
     numbers = carray(pointer(words[NUMBERS]), NUMBER_COUNT, np.float64)
@@ -34,12 +34,14 @@ def _opened(address: int) -> tuple[Words, Floats, Floats]:
 
 
 @inlined
-def _array(words: Words, place: int, size: int) -> Floats:
+def array(words: Words, place: int, size: int) -> Floats:
+    """Return an array by its word."""
     return carray(pointer(words[place]), size, np.float64)
 
 
 @inlined
-def _one(value: float) -> Floats:
+def one(value: float) -> Floats:
+    """Return a sequence of one value."""
     sequence = np.empty(1)
     sequence[0] = value
     return sequence
@@ -47,7 +49,7 @@ def _one(value: float) -> Floats:
 
 @inlined
 def _sum(words: Words, row: Floats) -> float:
-    weights = _array(words, WEIGHTS, row.size)
+    weights = array(words, WEIGHTS, row.size)
     total = 0.0
     for i in range(row.size):
         total += row[i] * weights[i]
@@ -55,7 +57,8 @@ def _sum(words: Words, row: Floats) -> float:
 
 
 @inlined
-def _moved(numbers: Floats, value: float, total: float) -> float:
+def moved(numbers: Floats, value: float, total: float) -> float:
+    """Keep the input and return the output, of which the bias is added to a sum."""
     output: float = numbers[BIAS] + total
     numbers[PRESENT] = value
     numbers[OUTPUT] = output
@@ -75,11 +78,11 @@ def stops(address: int, value: float) -> float:
     """Step stops beside a spring; their limits, and the origin of the spring."""
     if not math.isfinite(value):
         return math.nan
-    words, numbers, elements = _opened(address)
+    words, numbers, elements = opened(address)
     count = elements.size
-    row = sequences.stops(_one(value), numbers[PRESENT], _array(words, FIRST, count), elements)[0]
-    spring = _array(words, WEIGHTS, count + 1)[count] * (value - numbers[OWN])
-    return _moved(numbers, value, _sum(words, row) + spring)
+    row = sequences.stops(one(value), numbers[PRESENT], array(words, FIRST, count), elements)[0]
+    spring = array(words, WEIGHTS, count + 1)[count] * (value - numbers[OWN])
+    return moved(numbers, value, _sum(words, row) + spring)
 
 
 @kernel
@@ -87,10 +90,10 @@ def ramps(address: int, value: float) -> float:
     """Step kernels between ramps; where these begin upwards and downwards, and their width."""
     if not math.isfinite(value):
         return math.nan
-    words, numbers, elements = _opened(address)
-    rising, falling = _array(words, FIRST, elements.size), _array(words, SECOND, elements.size)
-    row = sequences.ramps(_one(value), rising, falling, numbers[OWN], elements)[0]
-    return _moved(numbers, value, _sum(words, row))
+    words, numbers, elements = opened(address)
+    rising, falling = array(words, FIRST, elements.size), array(words, SECOND, elements.size)
+    row = sequences.ramps(one(value), rising, falling, numbers[OWN], elements)[0]
+    return moved(numbers, value, _sum(words, row))
 
 
 @inlined
@@ -105,36 +108,11 @@ def plays(address: int, value: float) -> float:
     """Step plays between envelopes; their thresholds, the range, and of each envelope its numbers and ends."""
     if not math.isfinite(value):
         return math.nan
-    words, numbers, elements = _opened(address)
+    words, numbers, elements = opened(address)
     x = _within(numbers, value)
-    lower, upper = _one(_envelope(numbers, OWN + 2, x)), _one(_envelope(numbers, OWN + 6, x))
-    row = sequences.generalized_plays(lower, upper, _array(words, FIRST, elements.size), elements)[0]
-    return _moved(numbers, value, _sum(words, row))
-
-
-@inlined
-def _mapped(x: float, words: Words, place: int, count: int) -> float:
-    """Return a map of dead zones at x, by its thresholds, intercepts and slopes; without one, of -1, x itself."""
-    if count < 0:
-        return x
-    parts = _array(words, place, 3 * count + 2)
-    k = 0
-    while k < count and x > parts[k]:
-        k += 1
-    mapped: float = parts[count + k] + parts[2 * count + 1 + k] * x
-    return mapped
-
-
-@kernel
-def weighted_plays(address: int, value: float) -> float:
-    """Step plays between two maps; thresholds, weights and lines of the maps; the origin, and sizes of the maps."""
-    if not math.isfinite(value):
-        return math.nan
-    words, numbers, elements = _opened(address)
-    x = _one(_mapped(value - numbers[OWN], words, THIRD, int(numbers[OWN + 1])))
-    thresholds, weights = _array(words, FIRST, elements.size), _array(words, SECOND, elements.size)
-    total = memory.weighted_plays(x, thresholds, weights, elements)[0]
-    return _moved(numbers, value, _mapped(total, words, FOURTH, int(numbers[OWN + 2])))
+    lower, upper = one(_envelope(numbers, OWN + 2, x)), one(_envelope(numbers, OWN + 6, x))
+    row = memory.plays(lower, upper, array(words, FIRST, elements.size), elements)[0]
+    return moved(numbers, value, _sum(words, row))
 
 
 @kernel
@@ -142,10 +120,10 @@ def duhem(address: int, value: float) -> float:
     """Step the terms of a Duhem operator; the range, and the rate."""
     if not math.isfinite(value):
         return math.nan
-    words, numbers, elements = _opened(address)
-    x, present = _one(_within(numbers, value)), _within(numbers, numbers[PRESENT])
+    words, numbers, elements = opened(address)
+    x, present = one(_within(numbers, value)), _within(numbers, numbers[PRESENT])
     row = sequences.duhem(x, present, numbers[OWN + 2], elements.size // 2, elements)[0]
-    return _moved(numbers, value, _sum(words, row))
+    return moved(numbers, value, _sum(words, row))
 
 
 @kernel
@@ -153,10 +131,10 @@ def bouc_wen(address: int, value: float) -> float:
     """Step a Bouc-Wen operator; scale, beta, gamma, exponent and origin."""
     if not math.isfinite(value):
         return math.nan
-    words, numbers, elements = _opened(address)
+    words, numbers, elements = opened(address)
     scale = numbers[OWN]
     z = sequences.bouc_wen(
-        _one(value / scale),
+        one(value / scale),
         numbers[PRESENT] / scale,
         elements[0] / scale,
         numbers[OWN + 1],
@@ -164,6 +142,6 @@ def bouc_wen(address: int, value: float) -> float:
         numbers[OWN + 3],
     )
     elements[0] = scale * z[0]
-    weights = _array(words, WEIGHTS, 2)
+    weights = array(words, WEIGHTS, 2)
     total = weights[0] * (value - numbers[OWN + 4]) + weights[1] * elements[0]
-    return _moved(numbers, value, total)
+    return moved(numbers, value, total)

@@ -454,13 +454,12 @@ def best_staircases(columns: Table, widths: Floats) -> Floats:
 
 
 @kernel
-def plays(drive: Floats, thresholds: Fixed, state: Floats) -> Floats:
-    """Step the plays through `drive`; return their states sample by sample. `state` is changed."""
-    result = np.empty((drive.size, state.size))
-    for t in range(drive.size):
-        x = drive[t]
+def plays(lower: Floats, upper: Floats, thresholds: Fixed, state: Floats) -> Floats:
+    """Step plays between two drives; return their states sample by sample. `state` is changed."""
+    result = np.empty((lower.size, state.size))
+    for t in range(lower.size):
         for i in range(state.size):
-            state[i] = max(x - thresholds[i], min(x + thresholds[i], state[i]))
+            state[i] = max(lower[t] - thresholds[i], min(upper[t] + thresholds[i], state[i]))
             result[t, i] = state[i]
     return result
 

@@ -29,9 +29,10 @@ _BLOCK = 2**20
 class CompiledStep(NamedTuple):
     """What a stream of elements steps with."""
 
-    name: str  # the step, of `_element_stream_kernels`
+    name: str  # the step
     numbers: tuple[float, ...]  # the operator's numbers, in the order in which the step takes them
     arrays: tuple[Floats, ...] = ()  # its arrays, likewise; at most four
+    module: str = "element_stream_kernels"  # of the step
 
 
 class ElementOperator(Operator[ElementState]):
@@ -145,7 +146,7 @@ class ElementStream(Stream[ElementState]):
         step = operator.compiled_step()
         assert step is not None
         self.operator = operator
-        self._step = compiled_step(step.name, "element_stream_kernels")
+        self._step = compiled_step(step.name, step.module)
         self._places = kernels
         present, self._elements = operator._split(state)
         self._numbers = np.zeros(kernels.NUMBER_COUNT)

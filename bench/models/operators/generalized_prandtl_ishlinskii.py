@@ -176,13 +176,10 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
 
     def respond(self, inputs: Floats, present: float, elements: Floats) -> Floats:  # noqa: ARG002
         """Return the plays, shape (N, n)."""
-        from bench.models.kernels import element_kernels as _element_kernels
+        from bench.models.kernels import memory_kernels as _kernels
 
         x = self._x(inputs)
-        columns = _element_kernels.generalized_plays(
-            self.rising(x), self.falling(x), self.thresholds.copy(), elements
-        )
-        return np.asarray(columns)
+        return np.asarray(_kernels.plays(self.rising(x), self.falling(x), self.thresholds, elements))
 
     def compiled_step(self) -> CompiledStep:
         """Return the compiled step; see `ElementOperator.compiled_step`."""

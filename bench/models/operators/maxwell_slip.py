@@ -85,7 +85,7 @@ class MaxwellSlip(ElementOperator):
         """Return the deformations of the elements and of the spring, shape (N, n + 1)."""
         from bench.models.kernels import element_kernels as _element_kernels
 
-        columns = _element_kernels.stops(inputs, present, self.slips.copy(), elements)
+        columns = _element_kernels.stops(inputs, present, self.slips, elements)
         return np.column_stack([columns, inputs - self.origin])
 
     def compiled_step(self) -> CompiledStep:

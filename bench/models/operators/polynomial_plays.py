@@ -109,7 +109,7 @@ class PolynomialPlays(ElementOperator):
 
         low, high = self.input_range
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        plays = np.asarray(_kernels.plays(inputs, self.thresholds, elements))
+        plays = np.asarray(_kernels.plays(inputs, inputs, self.thresholds, elements))
         columns = [plays]
         if self.powers > 1:
             series = chebyshev_terms((plays - middle) / (half - self.thresholds), self.powers)

@@ -231,7 +231,8 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def _plays(self, inputs: ArrayLike, state: PlayState | None) -> Floats:
         from bench.models.kernels import memory_kernels as _kernels
 
-        return np.asarray(_kernels.plays(self._drive(inputs), self.thresholds, self._checked(state).copy()))
+        x = self._drive(inputs)
+        return np.asarray(_kernels.plays(x, x, self.thresholds, self._checked(state).copy()))
 
     def evaluate(self, inputs: ArrayLike, state: PlayState | None = None) -> Floats:
         """Return the outputs of a sequence, shape (N,), from `state` (default: relaxed).
@@ -290,7 +291,9 @@ class PrandtlIshlinskii(Operator[PlayState]):
         maps = self.before, self.after
         sizes = [-1 if zones is None else zones.thresholds.size for zones in maps]
         lines = [np.empty(0) if zones is None else np.concatenate(zones.lines) for zones in maps]
-        return CompiledStep("weighted_plays", (self.origin, *sizes), (self.thresholds, self.weights, *lines))
+        return CompiledStep(
+            "step_plays", (self.origin, *sizes), (self.thresholds, self.weights, *lines), "play_stream_kernels"
+        )
 
     def stream(self, state: PlayState | None = None) -> PlayStream:
         """Return the operator with a memory of its own, compiled; see `Operator.stream`.

@@ -105,19 +105,6 @@ def test_saturations():
     assert MemoryCurve.from_positive_saturation(50.0).corners(30.0, 70.0)[0, 1] == 70.0
 
 
-def test_description_tells_branch_and_reversals():
-    text = driven([60.0, 40.0, 50.0, 45.0]).describe("°C")
-    assert text.splitlines() == [
-        "falling at 45 °C, from negative saturation",
-        "3 reversals remembered, outermost first:",
-        "  maximum 60 °C",
-        "  minimum 40 °C",
-        "  maximum 50 °C",
-        "the innermost loop closes at 40 °C, 10 °C wide",
-    ]
-    assert "on a major branch" in driven([5.0]).describe()
-
-
 @cases(
     ("make", "message"),
     [
