@@ -271,9 +271,6 @@ class Slope:
 
     rate: float  # greatest rate of the input on continuous stretches, input units per second
     time: float  # when that is, s
-    # Greatest move of the input within one sample where it is not continuous: a reversal must first cross the stretch
-    # on which the output hardly answers, or goes the wrong way. Input units.
-    jump: float
 
     def within(self, limit: float) -> bool:
         """Return whether an actuator of this rate limit, input units per second, can follow."""
@@ -323,5 +320,4 @@ def fastest_slope(inverse: Inverse[S], times: ArrayLike, reference: ArrayLike, s
     turned |= ~np.isnan(followed.saturating[1:])
     smooth = np.where(turned, 0.0, rates)
     fastest = int(np.argmax(smooth))
-    jump = float(np.abs(moves[turned]).max()) if turned.any() else 0.0
-    return Slope(rate=float(smooth[fastest]), time=float(moments[fastest]), jump=jump)
+    return Slope(rate=float(smooth[fastest]), time=float(moments[fastest]))

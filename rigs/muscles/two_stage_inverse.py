@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -127,7 +126,7 @@ class TwoStageInverse:
         after, reached = self.model.move(state, voltage, argument)
         if length is not None:
             imposed = self._length_flag(reached, length)
-        return self._result(after, _flag(after.force, target, self._tolerances[0]), imposed)
+        return self._result(after, _flag(target - after.force, self._tolerances[0]), imposed)
 
     def _voltages(self, state: TwoStageState) -> tuple[float, float]:
         low, high = self.model.first.input_range
@@ -143,17 +142,15 @@ class TwoStageInverse:
         return self._first.nearest_input(state.first, state.voltage, force - argument)
 
     def _length_flag(self, reached: float, target: float) -> Reach:
-        return _flag(reached, target, self._tolerances[1])
+        return _flag(target - reached, self._tolerances[1])
 
     @staticmethod
     def _result(after: TwoStageState, reach: Reach, imposed: Reach = Reach.MET) -> TwoStageInversion:
         return TwoStageInversion(after.voltage, after.force, after.length, reach, imposed, after)
 
 
-def _flag(reached: float, target: float, tolerance: float) -> Reach:
-    if math.isclose(reached, target, rel_tol=0.0, abs_tol=tolerance):
-        return Reach.MET
-    return Reach.TOO_HIGH if target > reached else Reach.TOO_LOW
+def _flag(short: float, tolerance: float) -> Reach:
+    return Reach.of(abs(short) <= tolerance, short)
 
 
 def _rising_inverse(name: str, stage: Stage) -> Inverse[Any]:
