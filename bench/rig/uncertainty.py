@@ -48,7 +48,7 @@ Uncertain = Any
 Distribution = Literal["normal", "rectangular", "triangular", "U"]
 
 ROOM = "room"
-"""How one acts that is no error of a reading: the quantity follows the room, and what is identified with it."""
+"""A component that is no error of a reading: the quantity follows the room, and so do identified parameters."""
 _REMEDIES = {
     **dict.fromkeys(("gain", "offset", "nonlinearity"), "calibrate the sensor"),
     "drift": "calibrate more often, or correct for it",

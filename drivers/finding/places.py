@@ -129,7 +129,7 @@ def _asked_otherwise(entries: Iterable[DeviceEntry], port: Port, echo: bool) -> 
 
 
 def _echoes(port: Port) -> bool:
-    """Return whether the adapter at a port hands back what is sent, which it does at any speed and parity."""
+    """Return whether the adapter at a port echoes, which it does at any speed and parity."""
     return _heed(port, {}) == _EMPTY_LINE
 
 
