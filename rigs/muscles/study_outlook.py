@@ -54,6 +54,7 @@ STUDY = Study(
     carry_out,
     kernels=(
         "bench.models.kernels.actuator_kernels",
+        "bench.models.kernels.stream_kernels",
         "sim_devices.plants._friction_kernels",
         "sim_devices.instruments._flintec_kernels",
         "sim_devices.transducers._imperfect_kernels",
