@@ -173,7 +173,9 @@ def first_page(signals: Sequence[str], size: int) -> bytes:
 def copied_heading(db: sqlite3.Connection) -> list[Row]:
     """Return the rows that `copy_heading` has written; none if they are not all readable."""
     try:
-        rows = [decoded(line) for (line,) in db.execute("SELECT line FROM heading")]
+        lines = [line for (line,) in db.execute("SELECT line FROM heading")]
     except sqlite3.DatabaseError:
         return []
+    # A damaged cell may have any type.
+    rows = [decoded(line) if isinstance(line, bytes) else None for line in lines]
     return [row for row in rows if row is not None] if all(rows) else []

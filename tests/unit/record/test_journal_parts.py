@@ -371,6 +371,16 @@ class TestRecovering:
         journal.close()
         assert "completed" in damaged()["status"]
 
+    @pytest.mark.parametrize("cell", [None, "text", 3])
+    def test_a_damaged_copy_of_the_heading_takes_nothing_from_a_whole_one(self, tmp_path, cell):
+        unfinished(tmp_path, step_row(2))
+        with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db, db:
+            db.execute("CREATE TABLE other AS SELECT ? AS line", (cell,))
+            db.execute("DROP TABLE heading")
+            db.execute("ALTER TABLE other RENAME TO heading")
+        with Record(recover(tmp_path).copy) as record:
+            assert record.meta["identity"] == "one"
+
     def test_a_journal_of_another_schema_is_refused(self, tmp_path):
         unfinished(tmp_path)
         with closing(Store(tmp_path / FILE_NAME)) as store:
