@@ -29,6 +29,7 @@ from .study import (
     RunSeries as RunSeries,
     Study as Study,
     StudyResult as StudyResult,
+    prepare as prepare,
     published_of as published_of,
     reached_targets as reached_targets,
     reproduce as reproduce,

@@ -321,6 +321,18 @@ class Study:
         return (*_KERNELS, *self.kernels)
 
 
+def prepare(name: str, console: Console) -> None:
+    """Compile the kernels of a study, as `reproduce` does before its first run; the Makefile calls it.
+
+    Raises ConfigurationError if there is no such study.
+    """
+    # Here, as numba is slow to load.
+    from bench.base import compile_kernels
+
+    study: Study = registry.load("studies", name)
+    compile_kernels(study.all_kernels, console)
+
+
 def published_of(run: Path) -> tuple[Published, ...]:
     """Return what studies state of the rig of a run, or of the rig that its file extends.
 

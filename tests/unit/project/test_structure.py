@@ -112,6 +112,13 @@ def test_lines_are_opened_by_the_guardian_and_by_rigs_in_this_process_only():
     assert opening == WHERE_LINES_ARE_OPENED
 
 
+def test_what_the_makefile_imports_is_there():
+    found = re.findall(r"from (bench[\w.]*) import (\w+)", (ROOT / "Makefile").read_text("utf-8"))
+    assert found
+    for module, name in found:
+        assert hasattr(importlib.import_module(module), name)
+
+
 def test_no_file_is_long():
     lengths = {path.relative_to(ROOT).as_posix(): len(path.read_text("utf-8").splitlines()) for path in SOURCES}
     assert not {path: length for path, length in lengths.items() if length > LONGEST}
