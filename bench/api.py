@@ -187,7 +187,7 @@ def identify(
     Parameters
     ----------
     source : RunFolder, str or Path
-        A run, or a table of measurements: text, .gz, .mat, .h5, .tdms, .npz, .npy, .parquet or a spreadsheet.
+        A run, or a table of measurements: text, .gz, .mat, .h5, .tdms, .npz, .npy, .parquet, .json or a spreadsheet.
     model : str, optional
         Name of a registered model; several with commas between them, or all of one input if there is none, are
         compared by what is left out of their fits, and one of them is chosen.

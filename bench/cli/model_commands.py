@@ -32,7 +32,7 @@ DataArgument = Annotated[
     Path,
     typer.Argument(
         metavar="FILE",
-        help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet), or a run.",
+        help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet, .json), or a run.",
         parser=find_run,
         autocompletion=complete_run,
     ),
@@ -183,8 +183,8 @@ def identify_(
         list[Path] | None,
         typer.Argument(
             metavar="FILE",
-            help="Tables of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet), or runs; one model of all. "
-            "The newest run if not given.",
+            help="Tables of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet, .json), or runs; one model "
+            "of all. The newest run if not given.",
             parser=find_run,
             autocompletion=complete_run,
             show_default=False,
@@ -389,7 +389,7 @@ def invert(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="TARGETS.csv", help="Table of targets (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet)."
+            metavar="TARGETS.csv", help="Table of targets (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet, .json)."
         ),
     ],
     column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],

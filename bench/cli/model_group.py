@@ -38,7 +38,7 @@ def models_on_data(
         typer.Option(
             "--data",
             metavar="FILE",
-            help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet), or a run.",
+            help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet, .json), or a run.",
             parser=find_run,
         ),
     ],

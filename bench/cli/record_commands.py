@@ -167,7 +167,9 @@ def _named(run: Path, folder: Path) -> str:
 def import_(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet)."),
+        typer.Argument(
+            metavar="FILE", help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet, .json)."
+        ),
     ],
     input_column: Annotated[
         str, typer.Option("--input", metavar="COLUMN", help="Column of the input, or FILE:COLUMN.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +27,8 @@ _OVERLOAD = 9.9e37
 """What instruments write for an overload, and more for no number. Source: SCPI 1999, volume 1, section 7.2.1."""
 
 _SPREADSHEETS = b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+
+_JSON = ".json", ".jsonl", ".ndjson"
 
 _LIST = re.compile(r",(?![^(\[]*[)\]])")
 """Between names of columns, of which one may be `A(:,1)`."""
@@ -115,7 +117,8 @@ def read_columns(
     options : ReadingOptions, optional
         What is known of the layout of a file; the rest is found.
     times : sequence of str
-        The first of these columns that is there, can be read, and has a unit of time or none, is read too.
+        If there are any, the column of times is read too, where it can be: the first of these that has a unit of time
+        or none, or that which its name, its unit, or dates and times in it show.
 
     Raises
     ------
@@ -133,12 +136,12 @@ def read_columns(
     else:
         try:
             columns = _from_files(path, names, options, times)
-        except DataError:
+        except DataError as error:
             if not times:
                 raise
             # Of a file that can be read without times their column is at fault.
-            read_columns(path, names, at_least=at_least, options=options)
-            return read_columns(path, names, at_least=at_least, options=options, times=times[1:])
+            found = read_columns(path, names, at_least=at_least, options=options)
+            return replace(found, assumptions=f"{found.assumptions}, time is left out: {error}")
     _check_rows(path, len(next(iter(columns.values.values()))), at_least)
     for name, values in columns.values.items():
         beyond = np.flatnonzero(np.abs(values) >= _OVERLOAD)
@@ -272,6 +275,8 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequen
         return partial(read_arrays, kind="MATLAB")
     if path.suffix.lower() == ".npz":
         return partial(read_arrays, kind="NumPy")
+    if path.suffix.lower() in _JSON:
+        return partial(read_arrays, kind="JSON")
     if start.startswith(_SPREADSHEETS):
         return read_spreadsheet
     kinds = {HDF5: "HDF5", b"TDSm": "TDMS", b"PAR1": "Parquet", b"\x93NUM": "NumPy"}

@@ -37,8 +37,6 @@ NO_TIMES = "none"
 
 TIME_COLUMN = "time_column"
 """Parameter of an imported run: the column of times of its file."""
-# Heads that name a column of times.
-_TIMES = ("time", "t", "Time", "time_s", "t_s", "Time_s", "timestamp", "Timestamp", "datetime")
 
 
 @dataclass(frozen=True)
@@ -294,7 +292,7 @@ def time_names(path: Path, model: ModelFile | None = None) -> tuple[str, ...]:
     quasi-static.
     """
     own = None if model is None else model.provenance.get("time")
-    names: tuple[str, ...] = _TIMES
+    names: tuple[str, ...] = ("time",)
     if is_run(path):
         with Record(path) as record:
             names = ("t", "finished") if TIME_COLUMN in record.meta["parameters"] else ("t",)

@@ -263,11 +263,9 @@ class TestOtherFormats:
     def test_what_is_no_table(self, tmp_path, content, kind, names):
         message = refused(tmp_path, content, names, "file.txt")
         assert message.startswith(
-            f"file.txt: is {kind}, not a table; text, .gz of text, .mat, .h5, .tdms, .npz, .parquet and spreadsheets"
+            f"file.txt: is {kind}, not a table; text, .gz of text, .mat, .h5, .tdms, .npz, .parquet, .json and "
+            "spreadsheets"
         )
-
-    def test_an_array_in_a_file_of_json(self, tmp_path):
-        assert "is JSON, not a table" in refused(tmp_path, "[1.5, 2.5,\n3.5]", ("1",), "file.json")
 
     @cases("above", ['{"sample": 3}\n', '{"sample": {\n"a": 3}}\n', "[[Data]]\n", "[Header]\n"])
     def test_what_stands_above_a_table(self, tmp_path, above):

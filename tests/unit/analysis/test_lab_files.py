@@ -1,6 +1,7 @@
 """One table in the layouts in which laboratories have it: each is read, or refused with the option that reads it."""
 
 import gzip
+import json
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -45,6 +46,7 @@ SEGMENT = "***End_of_Header***\t\t\t\nX_Value\tU\ty\tComment\n"
 HALVES = [[column[part] for column in (TIME, U, Y)] for part in (slice(20), slice(20, None))]
 BRANCHES = [column for half in HALVES for column in half[1:]]
 ROW = body().splitlines(keepends=True)[20]
+COLUMNS = {"time": TIME.tolist(), "U": U.tolist(), "y": Y.tolist()}
 ORDER = np.argsort(np.round(U, 1), kind="stable")
 
 
@@ -264,7 +266,10 @@ LAYOUTS = {
         sheets(run=rows(43922.5 + DAYS, U, Y)[1:]), "times in days of Excel by their magnitude",
         {"names": ("2", "3"), "time": "1", "file": "d.xlsx"},
     ),
-    "moments in a sheet": (sheets(run=rows(MOMENTS, U, Y)), "dates and times", {"file": "d.xlsx", **TIMED}),
+    "moments in a sheet": (
+        sheets(run=rows([moment + timedelta(seconds=59) for moment in MOMENTS], U, Y)), "dates and times",
+        {"file": "d.xlsx", **TIMED},
+    ),
     "Strict Open XML": (strict, "sheet run", {"file": "d.xlsx"}),
     "vectors of MATLAB": (matlab(U=U, y=Y[:, None], note="x"), "MATLAB", {"file": "d.mat"}),
     "a matrix of MATLAB": (
@@ -302,6 +307,35 @@ LAYOUTS = {
         numpy_file(np.vstack([TIME, U, Y])), "d: 3 × 40, its rows read as columns",
         {"file": "d.npy", "names": ("2", "d(3,:)")},
     ),
+    "signals of Simulink": (
+        matlab(
+            out={
+                "time": TIME,
+                "signals": np.array(
+                    [(U, "U", 1), (Y, "y", 1)], dtype=[("values", "O"), ("label", "O"), ("dimensions", "O")]
+                ),
+            }
+        ), "MATLAB", {"file": "d.mat", **TIMED},
+    ),
+    "signals of dSPACE": (
+        matlab(
+            X={"Raster": "task", "Data": TIME},
+            Y=np.array([("U", U, "V"), ("y", Y, "µm")], dtype=[("Name", "O"), ("Data", "O"), ("Unit", "O")]),
+        ), "MATLAB", {"file": "d.mat", "time": "X.Data", **UNITS},
+    ),
+    "columns of JSON": (json.dumps(COLUMNS), "JSON", {"file": "d.json", **TIMED}),
+    "records of JSON": (
+        json.dumps([dict(zip(COLUMNS, row, strict=True)) for row in zip(*COLUMNS.values(), strict=True)]), "JSON",
+        {"file": "d.json", **TIMED},
+    ),
+    "lines of JSON": (
+        "".join(
+            json.dumps({"time": f"{moment:%FT%T.%f}", "U": u, "y": y}) + "\n"
+            for moment, u, y in zip(MOMENTS, U, Y, strict=True)
+        ), "dates and times", {"file": "d.jsonl", **TIMED},
+    ),
+    "a null of JSON": (json.dumps({"U": [1, 2, 3], "y": [1, None, 3]}), "row 2, .* nan", {"file": "d.json", **NOT}),
+    "numbers of JSON": ("[1.5, 2.5,\n3.5]", "no column 'U'", {"file": "d.json", **NOT}),
     "objects of NumPy": (numpy_file(np.array([None, {}])), "allow_pickle", {"file": "d.npy", **NOT}),
     "texts in Parquet": (parquet(), "no column 'note'", {"file": "d.parquet", "names": ("U", "note"), **NOT}),
     **{
@@ -320,6 +354,7 @@ LAYOUTS = {
     },
 }  # fmt: skip
 pytestmark = pytest.mark.usefixtures("warm_popen")
+SOUGHT = ColumnNames("U", "y", times=("time",))
 OPTIONS = ("table", "skip_lines", "interval", "time_unit")
 
 
@@ -343,3 +378,32 @@ def test_a_layout_is_read_or_refused_with_what_reads_it(tmp_path, name):
     assert (data.input.unit, data.output.unit) == asked.get("units", (data.input.unit, data.output.unit))
     if asked["time"] or "interval" in asked:
         np.testing.assert_allclose(data.times - data.times[0], TIME, atol=asked["near"])
+
+
+@cases(
+    "head",
+    [
+        "time", "T", "Timestamp", "Date/Time", "X_Value", "Running Time [s]", "Prüfzeit (s)", "time_s", "x-axis [s]",
+        "clock [s],clock [s]",
+    ],
+)  # fmt: skip
+def test_times_are_found_by_their_name_or_their_unit(tmp_path, head):
+    times = np.transpose(np.tile(TIME, (head.count(",") + 1, 1))).tolist()
+    path = write(tmp_path, timed([",".join(map(str, row)) for row in times], head))
+    np.testing.assert_allclose(read_dataset([path], SOUGHT).times, TIME)
+
+
+def test_times_are_found_by_dates_whatever_their_name(tmp_path):
+    path = write(tmp_path, timed([f"{moment:%F %T.%f}" for moment in MOMENTS], "logged"))
+    np.testing.assert_allclose(read_dataset([path], SOUGHT).times, TIME, atol=1e-5)
+
+
+@cases("head", ["run", "time [V]", "step", "temperature [°C]"])
+def test_other_columns_are_no_times(tmp_path, head):
+    assert read_dataset([write(tmp_path, timed(TIME, head))], SOUGHT).times is None
+
+
+def test_times_that_cannot_be_read_are_left_out_and_said(tmp_path):
+    data = read_dataset([write(tmp_path, timed([*TIME[:9], "late", *TIME[10:]]))], SOUGHT)
+    assert data.times is None
+    assert "'late' is not a number" in data.assumptions

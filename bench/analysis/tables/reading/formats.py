@@ -11,7 +11,6 @@ from bench.base import DataError, end_of_json
 
 _MARKUP = re.compile(r"\s*<(?:\?xml|!doctype|svg|html|table)\b", re.IGNORECASE)
 _JSON = re.compile(r'\s*(?:\{\s*["}]|\[\s*["{[])')
-_ARRAY = re.compile(r"\s*[\[{]")
 _BELOW = "; of a table below it, leave out the lines above with --format skip=N"
 _OTHERS = {"%PDF-": "PDF", "%!PS": "PostScript", "{\\rtf": "RTF"}
 
@@ -25,7 +24,7 @@ def check_format(path: Path, lines: Sequence[str]) -> None:
     kind = next((name for start, name in _OTHERS.items() if text.startswith(start)), None)
     if _MARKUP.match(text):
         kind = _markup(text)
-    elif _is_json(text, _ARRAY if path.suffix.lower() == ".json" else _JSON):
+    elif _is_json(text):
         kind = "JSON"
     if kind is not None:
         raise DataError(f"{path}: is {kind}, not a table; {WHAT_IS_READ}{_BELOW if kind == 'XML' else ''}")
@@ -38,9 +37,9 @@ def _markup(text: str) -> str:
     return "HTML" if "<html" in folded or "<table" in folded else "XML"
 
 
-def _is_json(text: str, start: re.Pattern[str]) -> bool:
+def _is_json(text: str) -> bool:
     """Return whether a text begins with JSON, perhaps cut off, that is not the first lines above a table."""
-    if not start.match(text):
+    if not _JSON.match(text):
         return False
     text = text.strip()
     try:
@@ -48,4 +47,4 @@ def _is_json(text: str, start: re.Pattern[str]) -> bool:
     except ValueError as error:
         return getattr(error, "pos", 0) >= len(text) - 1
     rest = text[end:]
-    return not rest.strip() or start.match(rest) is not None
+    return not rest.strip() or _JSON.match(rest) is not None

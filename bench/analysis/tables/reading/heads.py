@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -31,6 +31,9 @@ SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0, "ms": 1e-3, "µs": 
 
 _TIME_HEAD = re.compile(r"(t|\w*time|elapsed|timestamp)[_ ](d|days?|h|hours?|min|s|secs?|ms|us|µs|ns)", re.IGNORECASE)
 """Head of a column of times whose unit stands behind its name."""
+
+_TIME_NAME = re.compile(r"t|ts|times?|time ?stamp|date[ /]?time|x_value", re.IGNORECASE)
+"""Names of a column of times. Source of `X_Value`: NI, "Specification for the LabVIEW Measurement File (.lvm)"."""
 
 _BEHIND = re.compile(r"(.+?)(?:[ _](?=\w+_per_)|, ?| in )(?![\d-])(\S+)")
 """A head whose unit is spelled out, or stands behind a comma or an `in`."""
@@ -148,7 +151,8 @@ def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> in
     places = places or [i for i, head in enumerate(heads) if _folded(head.name) == wanted]
     if not places:
         # A unit that is not known as one; the last part of `S.part`.
-        loose = [i for i, text in enumerate(texts) if wanted in (*_without_unit(text), text.rpartition(".")[2])]
+        last = [{text.rpartition(".")[2], _folded(heads[i].name).rpartition(".")[2]} for i, text in enumerate(texts)]
+        loose = [i for i, text in enumerate(texts) if wanted in (*_without_unit(text), *last[i])]
         places = loose if len(loose) == 1 else []
     if len(places) == 1:
         return places[0]
@@ -172,15 +176,34 @@ def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> in
 
 
 def with_times(
-    names: Sequence[str], times: Sequence[str], heads: Sequence[Head], find: Callable[[str], int]
+    names: Sequence[str],
+    times: Sequence[str],
+    heads: Sequence[Head],
+    find: Callable[[str], int],
+    moments: Collection[int] = (),
 ) -> list[str]:
-    """Return names of columns, and the first of `times` that `find` finds, with a unit of time or none."""
+    """Return names of columns, and that of the column of times if `times` asks for it and there is one.
+
+    It is the first of `times` that `find` finds; otherwise the first that is named as times are, has a unit of time,
+    or is one of those with dates and times, `moments`. A name is none whose unit is another.
+    """
+    units = ["" if place in moments else head.unit for place, head in enumerate(heads)]
+    may_be = [unit in ("", *SECONDS) for unit in units]
     for name in times:
         with suppress(DataError):
             place = find(name)
-            if (heads[place].unit if place < len(heads) else "") in ("", *SECONDS):
+            if place >= len(heads) or may_be[place]:
                 return [*names, name]
-    return list(names)
+    rules = (
+        [may_be[i] and _TIME_NAME.fullmatch(head.name) is not None for i, head in enumerate(heads)],
+        [unit in SECONDS for unit in units],
+        [place in moments for place in range(len(heads))],
+    )
+    found = next((rule.index(True) for rule in rules if times and True in rule), None)
+    if found is None:
+        return list(names)
+    text = heads[found].text
+    return [*names, text if [head.text for head in heads].count(text) == 1 and text else str(found + 1)]
 
 
 def spelled(unit: str) -> str:

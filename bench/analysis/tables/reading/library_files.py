@@ -5,6 +5,7 @@ Run as a module with the name of a file it writes the contents, pickled, to its 
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import re
@@ -12,6 +13,9 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
+from datetime import date, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +31,7 @@ from bench.base import (
     check_extra,
     how_to_install,
     needed_for,
+    parse_json,
 )
 
 HDF5 = b"\x89HDF"
@@ -40,6 +45,7 @@ _KINDS: dict[str, tuple[str, str, Extra]] = {
     "TDMS": ("a TDMS file", "nptdms", "files"),
     "Parquet": ("a parquet file", "pyarrow", "report"),
     "NumPy": ("a NumPy file", "numpy", "files"),
+    "JSON": ("JSON", "json", "files"),
     "spreadsheet": ("a spreadsheet", "python_calamine", "files"),
 }
 """By kind its words, the library that reads it, and the extra of that."""
@@ -107,15 +113,34 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
         parts = {str(name): _plain(part) for name, part in value.items()}
         return {name: part for name, part in parts.items() if part is not None} or None
     array = np.squeeze(np.asarray(value))
+    if array.dtype.names and (labelled := _by_label(array)):
+        return labelled
     if array.dtype.names and array.size == 1:
         return _plain({name: array[name].item() for name in array.dtype.names})
     if array.dtype.names:
         return _plain({name: array[name] for name in array.dtype.names})
     if array.dtype == object and array.size > 1:
         return _of_cells(array)
+    if array.dtype.kind == "U" and array.size > 1 and ":" in array.flat[0]:
+        with suppress(ValueError):
+            array = array.astype("datetime64[us]")
     if array.dtype.kind == "M":
         return np.atleast_1d(array)
     return np.atleast_1d(array).astype(np.float64) if array.dtype.kind in "fiub" and array.ndim <= 2 else None
+
+
+def _by_label(structures: npt.NDArray[Any]) -> dict[str, Any]:
+    """Return the vectors of structures that have one beside its name and unit, as of Simulink and dSPACE."""
+    found = {}
+    for structure in structures.flat:
+        parts = {name.lower(): np.squeeze(structure[name]) for name in structures.dtype.names or ()}
+        texts = {name: str(part) for name, part in parts.items() if part.dtype.kind == "U" and part.size == 1}
+        vectors = [part for part in parts.values() if part.dtype.kind in "fiu" and part.size > 1]
+        label = texts.get("name") or texts.get("label")
+        if not label or len(vectors) != 1:
+            return {}
+        found[_with_unit(label, texts.get("unit"))] = _plain(vectors[0])
+    return found
 
 
 def _of_cells(array: npt.NDArray[Any]) -> Any:  # noqa: ANN401
@@ -199,6 +224,23 @@ def _numpy(path: Path) -> dict[str, Any]:
     return {path.stem: found} if isinstance(found, np.ndarray) else dict(found)
 
 
+def _json(path: Path) -> dict[str, Any]:
+    text = path.read_text("utf-8-sig")
+    try:
+        found = parse_json(text)
+    except ValueError:
+        found = [parse_json(line) for line in text.splitlines() if line.strip()]
+    if isinstance(found, list) and all(isinstance(row, dict) for row in found):
+        found = {name: [row.get(name) for row in found] for name in dict.fromkeys(chain.from_iterable(found))}
+    columns = found if isinstance(found, dict) else {path.stem: found}
+    return {name: _without_null(column) for name, column in columns.items()}
+
+
+def _without_null(column: Any) -> Any:  # noqa: ANN401
+    """Return what JSON holds with NaN in place of null in a list."""
+    return [math.nan if cell is None else cell for cell in column] if isinstance(column, list) else column
+
+
 def _sheets(path: Path) -> dict[str, tuple[str, ...]]:
     from python_calamine import CalamineWorkbook
 
@@ -213,6 +255,9 @@ def _sheets(path: Path) -> dict[str, tuple[str, ...]]:
 
 
 def _cell(cell: object) -> str:
+    if isinstance(cell, date) and not isinstance(cell, datetime):
+        # A moment at midnight.
+        return f"{cell} 00:00:00"
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < 2**53:
         return str(int(cell))
     return re.sub(r'[\s"]+', " ", str(cell))
@@ -224,7 +269,8 @@ def _with_unit(name: str, unit: object) -> str:
 
 
 _LOADERS = {
-    "MATLAB": _matlab, "HDF5": _hdf5, "TDMS": _tdms, "Parquet": _parquet, "NumPy": _numpy, "spreadsheet": _sheets,
+    "MATLAB": _matlab, "HDF5": _hdf5, "TDMS": _tdms, "Parquet": _parquet, "NumPy": _numpy, "JSON": _json,
+    "spreadsheet": _sheets,
 }  # fmt: skip
 
 

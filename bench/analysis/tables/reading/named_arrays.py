@@ -39,7 +39,8 @@ def read_arrays(
         raise DataError(f"{path}: has no vector, matrix or table of numbers")
     heads = make_heads(list(found))
     arrays = list(found.values())
-    names = with_times(names, times, heads, lambda name: find_place(path, heads, len(heads), name))
+    dates = [place for place, array in enumerate(arrays) if array.dtype.kind == "M"]
+    names = with_times(names, times, heads, lambda name: find_place(path, heads, len(heads), name), dates)
     try:
         places = [find_place(path, heads, len(heads), name) for name in names]
     except NoColumnError as error:

@@ -15,7 +15,7 @@ from typing import BinaryIO, cast
 
 from bench.base import DataError, reason, say_share
 
-WHAT_IS_READ = "text, .gz of text, .mat, .h5, .tdms, .npz, .parquet and spreadsheets are read"
+WHAT_IS_READ = "text, .gz of text, .mat, .h5, .tdms, .npz, .parquet, .json and spreadsheets are read"
 """Kinds of files, for messages."""
 
 FALLBACK = "cp1252"

@@ -135,7 +135,9 @@ def _read_table(
     ending: Ending | None = None,
 ) -> ReadColumns:
     """Read columns of a table; _SeveralError if its end is unknown and other tables follow."""
-    names = with_times(names, times, layout.heads, lambda name: _place(file, layout, name))
+    row = next(split_rows(lines[layout.start - options.skip_lines :], layout.delimiter), None)
+    moments = with_moments(row.cells, range(len(layout.heads))) if row is not None else ()
+    names = with_times(names, times, layout.heads, lambda name: _place(file, layout, name), moments)
     layout, places = _find_places(file, names, options, layout, lines)
     body = _Body(file, layout, names, places, options)
     body.ending = ending
