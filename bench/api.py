@@ -12,10 +12,10 @@ Leaving the block brings every device into its safe state before its line is clo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,7 @@ from bench.analysis import (
     compare_runs,
     identify_best,
     identify_model,
+    input_and_output,
     invert_targets,
     is_comparison,
     list_runs,
@@ -46,7 +47,7 @@ from bench.analysis import (
     select_runs,
     time_names,
 )
-from bench.base import BenchError, ConfigurationError, DeviceError, VirtualClock, show_patience, wall_time
+from bench.base import ConfigurationError, DeviceError, VirtualClock, show_patience, wall_time
 from bench.batch import published_of
 from bench.deployment import Deployment, Real, controller_of_rig, deploy as export_model
 from bench.execution import Rehearsal, Run, carry_out, foresee
@@ -174,26 +175,36 @@ def run(
     return RunFolder(result.folder)
 
 
+class Table(Protocol):
+    """Columns of measurements by their heads, such as a dictionary of arrays or a data frame."""
+
+    def keys(self) -> Iterable[Any]:
+        """Return the heads; a unit at the end, as in `force [N]`, is that of the column."""
+
+    def __getitem__(self, name: Any, /) -> Any:  # noqa: ANN401 - what holds the values of a column
+        """Return the values of a column."""
+
+
 def identify(
-    source: RunFolder | str | Path,
+    source: RunFolder | str | Path | Sequence[RunFolder | str | Path] | Table,
     model: str | None = None,
     *,
     input: str | None = None,  # noqa: A002 - the word of the command line
     output: str | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
-    """Identify a model from a run or a file of measurements.
+    """Identify a model from measurements: of a run, of a file, of several of them, or in memory.
 
     Parameters
     ----------
-    source : RunFolder, str or Path
-        A run, or a table of measurements: text, .gz, .mat, .h5, .tdms, .npz, .npy, .parquet, .json or a spreadsheet.
+    source : RunFolder, str, Path, a list of them, or Table
+        A run, or a table of measurements: text, .gz, .mat, .h5, .tdms, .npz, .npy, .parquet, .json or a spreadsheet;
+        or a dictionary of arrays or a data frame. Several are taken one after another.
     model : str, optional
         Name of a registered model; several with commas between them, or all of one input if there is none, are
         compared by what is left out of their fits, and one of them is chosen.
     input, output : str, optional
-        Columns, by name or by number from 1; of a run, the reading of its slot `drive` and the signal of its slot
-        `response` if not given.
+        Columns, by name or by number from 1; of a run, the signals of its slots `drive` and `response` if not given.
     **options
         As in `bench.analysis.FitOptions`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`, and the
         options of the model; `time_column` for a model with time and `weights_column`; and those of `ReadingOptions`
@@ -205,7 +216,7 @@ def identify(
     DataError
         If the measurements cannot be used.
     ConfigurationError
-        If there is no such model, or an option does not belong to it.
+        If there is no such model, an option does not belong to it, or a column is not given: names those there are.
 
     Examples
     --------
@@ -220,22 +231,26 @@ def identify(
     >>> invert(model, [500.0, 900.0]).flags
     ('met', 'met')
     """
-    folder = _folder(source)
-    if folder.is_dir():
-        recorded = RunFolder(folder)
-        input, output = input or recorded.signal_of("drive"), output or recorded.signal_of("response")  # noqa: A001
-    if input is None or output is None:
-        raise BenchError(f"{folder}: name the columns: input=..., output=...")
+    table: dict[str, npt.ArrayLike] | None = None
+    if isinstance(source, (RunFolder, str, Path)):
+        paths = [_folder(source)]
+    elif isinstance(source, Sequence):
+        if not source:
+            raise ConfigurationError("expected a run, a file or a table; the list of them is empty")
+        paths = [_folder(part) for part in source]
+    else:
+        paths, table = [Path("the table")], {str(name): source[name] for name in source.keys()}  # noqa: SIM118
     reading = ReadingOptions(
         **{field.name: options.pop(field.name) for field in fields(ReadingOptions) if field.name in options}
     )
     time = options.pop("time_column", None)
     model = model or ALL
     is_compared = is_comparison(model)
-    times = time_names(folder) if is_compared and time is None else ()
-    names = ColumnNames(input, output, time, options.pop("weights_column", None), times)
-    with show_patience(f"reading and fitting {folder.name}", Console(stderr=True)):
-        data = read_dataset([folder], names, reading, at_least=FEWEST_ROWS)
+    times = time_names(paths[0]) if is_compared and time is None and len(paths) == 1 else ()
+    columns = input_and_output(paths[0], (input or "", output or ""), reading, table)
+    names = ColumnNames(*columns, time, options.pop("weights_column", None), times)
+    with show_patience(f"reading and fitting {paths[0].name}", Console(stderr=True)):
+        data = read_dataset(paths, names, reading, at_least=FEWEST_ROWS, table=table)
         if not is_compared:
             return identify_model(data, model, FitOptions.of(options)).with_uncertainty()
         data = data if time is not None else data.with_usable_times()

@@ -618,7 +618,7 @@ def _uncertainty_lines(identified: IdentifiedFile) -> list[tuple[str, str]]:
     data = identified.data
     if identified.uncertainty is not None:
         return identified.uncertainty.lines()
-    if data.output is None or not is_run(data.paths[0]):
+    if not any(map(is_run, data.paths)) or data.output is None:
         return []
     why = f"the rig file states none of {data.output.name}"
     if identified.refit is None:

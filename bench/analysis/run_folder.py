@@ -218,19 +218,6 @@ class RunFolder:
         """What the protocol noted."""
         return [event.text for event in self.events if event.kind == "note"]
 
-    def signal_of(self, slot: str) -> str:
-        """Return the signal to which the protocol's slot was bound.
-
-        Raises DataError if the protocol had no such slot.
-        """
-        slots = self.meta.get("slots", {})
-        if slot not in slots:
-            raise DataError(
-                f"{self.folder}: the protocol had no slot {slot!r}, so input and output must be named; "
-                f"it had: {', '.join(slots) or 'none'}"
-            )
-        return str(slots[slot]["signal"])
-
     def plot(self, kind: Literal["signals", "loops"] = "signals") -> Picture:
         """Draw the signals over time, or the loop that its dashboard shows first.
 

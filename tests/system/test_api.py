@@ -6,11 +6,12 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas
 import pytest
 
 import bench
 import bench.api
-from bench.base import BenchError, ConfigurationError, DataError, InterlockError
+from bench.base import ConfigurationError, DataError, InterlockError
 from bench.identification import ModelFile
 
 
@@ -65,9 +66,6 @@ def test_a_run_is_tables_with_units(found):
     assert "35 rows" in text
     assert "creep on vo2: completed, 35 readings" in repr(found)
     assert len(found.notes) == 2
-    assert found.signal_of("response") == "curvature"
-    with pytest.raises(DataError, match=r"no slot 'load'.* drive, response"):
-        found.signal_of("load")
     assert bench.load(str(found.folder)).status == "completed"
 
 
@@ -90,6 +88,30 @@ def test_a_model_is_saved_loaded_and_reported(found, tmp_path, capsys):
     assert bench.predict(loaded, [40.0]) == bench.predict(tmp_path / "model.json", [40.0])
     assert bench.report(found, [model])["status"] == "completed"
     assert "polynomial" in capsys.readouterr().out
+
+
+def test_a_table_in_memory_is_identified_as_the_same_in_a_file(tmp_path):
+    time = np.arange(60) * 0.5
+    inputs = np.sin(time)
+    columns = {"time [s]": time, "U [V]": inputs, "x [mm]": inputs**3}
+    frame = pandas.DataFrame(columns)
+    frame.to_csv(tmp_path / "table.csv", index=False)
+    models = [bench.identify(source, input="U", output="x") for source in (tmp_path / "table.csv", frame, columns)]
+    outputs = [bench.predict(model, inputs, times=time) for model in models]
+    np.testing.assert_allclose(outputs[1:], [outputs[0], outputs[0]], rtol=1e-12)
+    assert {(model.data.input.unit, model.data.output.unit) for model in models} == {("V", "mm")}
+    with pytest.raises(DataError, match="row 3, column x"):
+        bench.identify({"U": [1.0, 2.0, 3.0], "x": [1.0, 2.0, np.nan]}, "polynomial", input="U", output="x")
+
+
+def test_of_several_files_each_is_left_out_once(tmp_path):
+    paths = [tmp_path / f"{name}.csv" for name in "abc"]
+    for phase, path in enumerate(paths):
+        inputs = np.sin(np.linspace(phase, 20.0, 60))
+        path.write_text("u,y\n" + "".join(f"{u},{u**3}\n" for u in inputs))
+    found = bench.identify(paths, "polynomial,polynomial-plays", input="u", output="y")
+    assert found.data.inputs.size == 180
+    assert found.data.starts == (0, 60, 120)
 
 
 @pytest.mark.parametrize("model", [None, "polynomial,polynomial-plays"])
@@ -127,7 +149,9 @@ def test_wrong_names_and_values(tmp_path, found):
         bench.run("creep", "vo2", out=tmp_path, warm=3.0)
     with pytest.raises(ConfigurationError, match="there is no model 'preisatch'"):
         bench.identify(found, "preisatch")
-    with pytest.raises(BenchError, match=r"name the columns"):
-        bench.identify(tmp_path / "file.csv", "preisach")
+    with pytest.raises(ConfigurationError, match=r"its columns are: U \[V\], x"):
+        bench.identify({"U [V]": [1.0, 2.0], "x": [1.0, 2.0]}, "preisach", output="x")
+    with pytest.raises(ConfigurationError, match="is empty"):
+        bench.identify([], "preisach")
     with pytest.raises(DataError, match="is not a run"):
         bench.load(tmp_path)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -99,6 +100,7 @@ def read_columns(
     at_least: int = 1,
     options: ReadingOptions | None = None,
     times: Sequence[str] = (),
+    table: Mapping[str, Any] | None = None,
 ) -> Columns:
     """Read columns of a file of measurements, or the readings of a run.
 
@@ -119,6 +121,8 @@ def read_columns(
     times : sequence of str
         If there are any, the column of times is read too, where it can be: the first of these that has a unit of time
         or none, or that which its name, its unit, or dates and times in it show.
+    table : mapping, optional
+        Columns by their heads, such as a data frame, which are read in place of a file; `path` is its name.
 
     Raises
     ------
@@ -130,17 +134,17 @@ def read_columns(
         If an option does not apply.
     """
     options = options or ReadingOptions()
-    if is_run(path):
+    if table is None and is_run(path):
         options.check_only(path, "a run", "table")
         columns = _from_run(path, names, options.table or _STEPS, at_least, times)
     else:
         try:
-            columns = _from_files(path, names, options, times)
+            columns = _from_files(path, names, options, times, table)
         except DataError as error:
             if not times:
                 raise
             # Of a file that can be read without times their column is at fault.
-            found = read_columns(path, names, at_least=at_least, options=options)
+            found = read_columns(path, names, at_least=at_least, options=options, table=table)
             return replace(found, assumptions=f"{found.assumptions}, time is left out: {error}")
     _check_rows(path, len(next(iter(columns.values.values()))), at_least)
     for name, values in columns.values.items():
@@ -153,7 +157,12 @@ def read_columns(
     return columns
 
 
-def input_and_output(path: Path, given: tuple[str, str], options: ReadingOptions | None = None) -> tuple[str, str]:
+def input_and_output(
+    path: Path,
+    given: tuple[str, str],
+    options: ReadingOptions | None = None,
+    table: Mapping[str, Any] | None = None,
+) -> tuple[str, str]:
     """Return the columns of input and output; those of a run that are not given are of its slots.
 
     Parameters
@@ -162,7 +171,7 @@ def input_and_output(path: Path, given: tuple[str, str], options: ReadingOptions
         A file or a run, as for `read_columns`.
     given : tuple of str
         The columns of input and output; an empty one is not given.
-    options : ReadingOptions, optional
+    options, table
         As for `read_columns`.
 
     Raises
@@ -175,7 +184,7 @@ def input_and_output(path: Path, given: tuple[str, str], options: ReadingOptions
     if all(given):
         return given
     known: Sequence[str]
-    if is_run(path):
+    if table is None and is_run(path):
         with Record(path) as record:
             slots = record.meta.get("slots", {})
             known = [header_with_unit(signal.name, signal.unit) for signal in record.signals]
@@ -185,7 +194,7 @@ def input_and_output(path: Path, given: tuple[str, str], options: ReadingOptions
             return given
     else:
         try:
-            _from_files(path, ["\0"], options or ReadingOptions(), ())
+            _from_files(path, ["\0"], options or ReadingOptions(), (), table)
         except NoColumnError as error:
             known = error.known
     options_ = zip(("--input", "--output"), given, strict=True)
@@ -264,8 +273,12 @@ def _as_text(cell: object) -> object:
     return cell
 
 
-def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequence[str]], ReadColumns]:
-    """Return what reads a kind of file, by its first bytes."""
+def _reader(
+    path: Path, table: Mapping[str, Any] | None
+) -> Callable[[Path, Sequence[str], ReadingOptions, Sequence[str]], ReadColumns]:
+    """Return what reads a kind of file, by its first bytes, or a table in memory."""
+    if table is not None:
+        return partial(read_arrays, kind="table", table=table)
     if path.exists() and not path.is_file():
         raise DataError(f"{path} is a pipe or a device, and a table is read more than once: save it to a file first")
     with reading_errors(path), path.open("rb") as file:
@@ -284,7 +297,13 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequen
     return read_text if kind is None else partial(read_arrays, kind=kind)
 
 
-def _from_files(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> Columns:
+def _from_files(
+    path: Path,
+    names: Sequence[str],
+    options: ReadingOptions,
+    times: Sequence[str],
+    table: Mapping[str, Any] | None = None,
+) -> Columns:
     """Read columns of a file, and of others those that are asked for as `FILE:COLUMN`."""
     elsewhere = {name: place for name in names if (place := find_elsewhere(path, name)) is not None}
     values: dict[str, Floats] = {}
@@ -296,7 +315,7 @@ def _from_files(path: Path, names: Sequence[str], options: ReadingOptions, times
         own = [elsewhere[name][1] if name in elsewhere else name for name in asked]
         if not asked:
             continue
-        found = _joined(file, own, options, times if file == path else ())
+        found = _joined(file, own, options, times if file == path else (), table if file == path else None)
         for name, column, unit in zip([*asked, *found.names[len(own) :]], found.values, found.units, strict=True):
             values[name], units[name] = column, unit
         time = (*found.names[len(own) :], time)[0]
@@ -323,9 +342,15 @@ def find_elsewhere(path: Path, name: str) -> tuple[Path, str] | None:
     return next(((place, column) for place in (Path(file), path.parent / file) if place.is_file()), None)
 
 
-def _joined(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> ReadColumns:
+def _joined(
+    path: Path,
+    names: Sequence[str],
+    options: ReadingOptions,
+    times: Sequence[str],
+    table: Mapping[str, Any] | None,
+) -> ReadColumns:
     """Read columns of a file; where it has none of the name of a list, its members are joined in order."""
-    reader = _reader(path)
+    reader = _reader(path, table)
     try:
         return reader(path, names, options, times)
     except NoColumnError:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -70,7 +71,7 @@ class Dataset:
     Attributes
     ----------
     paths : tuple of Path
-        The files, or folders of runs.
+        The files, or folders of runs; none of a table in memory.
     source : str
         The same for messages.
     input : Quantity
@@ -99,8 +100,8 @@ class Dataset:
 
     @property
     def name(self) -> str:
-        """The names of the files."""
-        return ", ".join(path.name for path in self.paths)
+        """The names of the files, or of the table."""
+        return ", ".join(path.name for path in self.paths) or self.source
 
     @property
     def inputs(self) -> Floats:
@@ -196,8 +197,11 @@ def read_dataset(
     reading: ReadingOptions | None = None,
     *,
     at_least: int = 1,
+    table: Mapping[str, Any] | None = None,
 ) -> Dataset:
     """Read measurements from files that `read_columns` reads, each of them once; errors as there.
+
+    A `table` in memory has one path, which is its name.
 
     Raises DataError too if the unit of a column differs from file to file, ConfigurationError if several files have
     times.
@@ -210,8 +214,10 @@ def read_dataset(
         raise ConfigurationError("--format interval=TIME: expected one file, without --time")
     wanted = [name for name in (names.input, names.output, names.weights, names.time, *names.others) if name]
     sought = () if names.time or interval else names.times
-    found = [read_columns(path, wanted, at_least=at_least, options=reading, times=sought) for path in paths]
-    first = found[0]
+    found = [
+        read_columns(path, wanted, at_least=at_least, options=reading, times=sought, table=table) for path in paths
+    ]
+    first, of_run = found[0], table is None and is_run(paths[0])
     for path, each in zip(paths, found, strict=True):
         for name in wanted:
             if each.units[name] != first.units[name]:
@@ -229,7 +235,7 @@ def read_dataset(
         rows = np.arange(columns[names.input].values.size) if first.kept is None else first.kept
         time = Quantity("time", "s", interval * rows.astype(np.float64))
         remarks.append(f"rows {interval:g} s apart")
-    elif time is not None and not is_run(paths[0]):
+    elif time is not None and not of_run:
         try:
             values = [column.values for column in columns.values()]
             kept, seconds, said = rows_in_time(first.source, time, values, reading.time_unit)
@@ -241,13 +247,13 @@ def read_dataset(
                 raise
     driven, measured, weights = (columns.get(name or "") for name in (names.input, names.output, names.weights))
     assert driven is not None
-    if not is_run(paths[0]) and measured is not None and _is_sorted(driven.values, measured.values):
+    if not of_run and measured is not None and _is_sorted(driven.values, measured.values):
         remarks.append("sorted by its input: the order of measurement is lost")
     starts = np.cumsum([0, *(each.values[names.input].size for each in found[:-1])])
     notes = [f"{path.name}: {each.assumptions}" for path, each in zip(paths, found, strict=True) if each.assumptions]
     several = len(paths) > 1
     return Dataset(
-        tuple(paths),
+        tuple(paths) if table is None else (),
         ", ".join(path.name for path in paths) if several else first.source,
         driven,
         measured,

@@ -102,23 +102,23 @@ def _load(kind: str, path: Path) -> tuple[Any, tuple[str, ...]]:
         if isinstance(found, dict) and found.pop(_LEFT_OUT, None)
         else ()
     )
-    return _plain(found), notes
+    return arrays_of(found), notes
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401
+def arrays_of(value: Any) -> Any:  # noqa: ANN401
     """Return arrays of numbers or moments, in mappings; None for what has none."""
     if hasattr(value, "columns") and hasattr(value, "to_numpy"):
         value = {str(name): value[name].to_numpy() for name in value.columns}
     if isinstance(value, Mapping):
-        parts = {str(name): _plain(part) for name, part in value.items()}
+        parts = {str(name): arrays_of(part) for name, part in value.items()}
         return {name: part for name, part in parts.items() if part is not None} or None
     array = np.squeeze(np.asarray(value))
     if array.dtype.names and (labelled := _by_label(array)):
         return labelled
     if array.dtype.names and array.size == 1:
-        return _plain({name: array[name].item() for name in array.dtype.names})
+        return arrays_of({name: array[name].item() for name in array.dtype.names})
     if array.dtype.names:
-        return _plain({name: array[name] for name in array.dtype.names})
+        return arrays_of({name: array[name] for name in array.dtype.names})
     if array.dtype == object and array.size > 1:
         return _of_cells(array)
     if array.dtype.kind == "U" and array.size > 1 and ":" in array.flat[0]:
@@ -139,13 +139,13 @@ def _by_label(structures: npt.NDArray[Any]) -> dict[str, Any]:
         label = texts.get("name") or texts.get("label")
         if not label or len(vectors) != 1:
             return {}
-        found[_with_unit(label, texts.get("unit"))] = _plain(vectors[0])
+        found[_with_unit(label, texts.get("unit"))] = arrays_of(vectors[0])
     return found
 
 
 def _of_cells(array: npt.NDArray[Any]) -> Any:  # noqa: ANN401
     """Return the numbers of cells as an array; if there are others, the arrays in them by their number."""
-    parts = [_plain(cell) for cell in array.flat]
+    parts = [arrays_of(cell) for cell in array.flat]
     if all(isinstance(part, np.ndarray) and part.size == 1 for part in parts):
         return np.reshape(np.concatenate(parts), array.shape)
     return {str(number): part for number, part in enumerate(parts, start=1) if part is not None} or None

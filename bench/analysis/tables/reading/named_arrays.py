@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.tables.reading.heads import NoColumnError, find_place, make_heads, with_times
-from bench.analysis.tables.reading.library_files import load_contents
+from bench.analysis.tables.reading.library_files import arrays_of, load_contents
 from bench.analysis.tables.reading.moments import since_first
 from bench.analysis.tables.reading.options import OF_ALL, ReadingOptions
 from bench.analysis.tables.reading.table import FEWEST_ROWS, ReadColumns
@@ -20,19 +20,25 @@ Array = npt.NDArray[Any]
 
 
 def read_arrays(
-    path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = (), *, kind: str
+    path: Path,
+    names: Sequence[str],
+    options: ReadingOptions,
+    times: Sequence[str] = (),
+    *,
+    kind: str,
+    table: Mapping[str, Any] | None = None,
 ) -> ReadColumns:
     """Read columns of a file of named arrays.
 
     Columns are the vectors, the columns of each matrix `A` as `A(:,1)`, or its rows as `A(1,:)` if they are few, and
     the parts of each structure, table or group `S` as `S.part`; `options.table` chooses one, whose columns then have
-    short names. Without it that is the only one, if nothing stands beside it.
+    short names. Without it that is the only one, if nothing stands beside it. `table` is read in place of a file.
 
     Raises DataError if the file cannot be read, a column is missing, columns differ in length, or a value is not
     finite; ConfigurationError if an option does not apply, or a library is not installed.
     """
     options.check_only(path, f"a {kind} file", "table", *OF_ALL)
-    contents, remarks = load_contents(path, kind)
+    contents, remarks = load_contents(path, kind) if table is None else (arrays_of(table), ())
     turned: list[str] = []
     found = _choose(path, contents or {}, options.table, turned)
     if not found:
@@ -64,8 +70,8 @@ def read_arrays(
         for column, moment in zip(chosen, are_moments, strict=True)
     ]
     values, units, moments = since_first(values, [heads[place].unit for place in places], names, are_moments)
-    table = (f"table {options.table}",) if options.table else ()
-    return ReadColumns(names, values, units, (kind, *table, *turned, *remarks, *moments))
+    named = (f"table {options.table}",) if options.table else ()
+    return ReadColumns(names, values, units, (kind, *named, *turned, *remarks, *moments))
 
 
 def _choose(path: Path, contents: dict[str, Any], table: str | None, turned: list[str]) -> dict[str, Array]:
