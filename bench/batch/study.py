@@ -55,10 +55,6 @@ kind = "calibrated"
 source = "{}"
 calibration = "{}"
 """
-_OF_RUNS = "bench.base.compilation_display", "bench.execution.run"
-"""Modules that every run takes."""
-_OF_RESULTS = "matplotlib.figure", "bench.dashboard"
-"""Modules that figures and recordings take."""
 
 
 @dataclass
@@ -128,7 +124,7 @@ class RunSeries:
         """
         settings = {**settings, **self.settings.get(protocol, {})}
         telling = [f"{key}={value}" for key, value in settings.items() if len(value) <= _TELLING]
-        run = self.workers.submit_as(
+        run = self.workers.submit(
             " ".join([protocol, *telling]),
             _carry_out,
             protocol,
@@ -188,7 +184,7 @@ class RunSeries:
         for model in identified:
             add_model(folder, model.name, result.outcome.laboratory_seconds, model.to_json())
         if self.records and folder not in self._recordings:
-            self._recordings[folder] = self.workers.submit_aside(
+            self._recordings[folder] = self.workers.submit(
                 f"recording of {folder.name}", export_run, folder, "rrd", None
             )
         return result
@@ -211,7 +207,7 @@ class RunSeries:
             Its other arguments; can be pickled.
         """
         path = self.folder / "figures" / f"{name}.{self.figure_format}"
-        self.workers.submit_aside(f"figure {name}", plot, path, *given, **named)
+        self.workers.submit(f"figure {name}", plot, path, *given, **named)
         return path
 
 
@@ -421,7 +417,7 @@ def reproduce(
 
     stopwatch = Stopwatch()
     folder = out / f"reproduce-{name}-seed-{seed}"
-    with Workers(1 if live else workers, console, name, _OF_RUNS, _OF_RESULTS, study.all_kernels) as pool:
+    with Workers(1 if live else workers, console, name, study.all_kernels) as pool:
         # Not before: a worker process loads its modules meanwhile.
         from bench.base import CompilationDisplay
 

@@ -109,10 +109,9 @@ def start_runs(campaign: RunSeries, *, verified: bool = True) -> dict[str, Pendi
     protocols: dict[str, dict[str, str]] = {"force-voltage": {}, "length-voltage": {}, "length-force": {}}
     if verified:
         protocols["length-verification"] = {"sequence_seed": str(campaign.seed + 1)}
-    with campaign.workers.together():
-        runs = {protocol: campaign.start(protocol, settings) for protocol, settings in protocols.items()}
-        # The longest one, and the models wait for it.
-        runs["length-force"].hurry()
+    runs = {protocol: campaign.start(protocol, settings) for protocol, settings in protocols.items()}
+    # The longest one, and the models wait for it.
+    runs["length-force"].hurry()
     return runs
 
 

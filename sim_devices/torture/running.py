@@ -308,12 +308,12 @@ def cells(task: Task, faults: list[str], seeds: int, processes: int | None, cons
     """Yield each run as it is judged, in the order of faults and seeds; one that hangs is one of its failures."""
     with Workers(processes, console, f"torture {task.rig}") as workers:
         waiting = [
-            workers.submit_as(f"no fault {seed}", reference_of, task, seed) for seed in range(max(seeds, _REFERENCES))
+            workers.submit(f"no fault {seed}", reference_of, task, seed) for seed in range(max(seeds, _REFERENCES))
         ]
         found = [each.result() for each in waiting]
         references = [each.widened(found) for each in found]
         pending = [
-            (name, seed, workers.submit_as(f"{name} {seed}", torture, task, name, seed, references[seed]))
+            (name, seed, workers.submit(f"{name} {seed}", torture, task, name, seed, references[seed]))
             for name in faults
             for seed in range(seeds)
         ]

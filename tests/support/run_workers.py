@@ -8,4 +8,4 @@ from bench.base import Workers
 
 with Workers(2) as workers:
     for _ in range(2):
-        workers.submit(worker_tasks.wait, sys.argv[1])
+        workers.submit("wait", worker_tasks.wait, sys.argv[1])

@@ -3,7 +3,6 @@
 import itertools
 import os
 import signal
-import sys
 import threading
 from pathlib import Path
 
@@ -24,11 +23,6 @@ def process(value):
 def ordinal():
     """Return how many such tasks this process carried out before."""
     return next(_ordinals)
-
-
-def is_loaded(module):
-    """Return whether a module was loaded before."""
-    return module in sys.modules
 
 
 def product(size):

@@ -37,10 +37,8 @@ class TasksDisplay:
             disable=not console.is_terminal,
             speed_estimate_period=600.0,
         )
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._whole = self._progress.add_task(title, total=None, text="", count="")
-        self._lines: dict[int, TaskID] = {}
-        self._shares: dict[int, float] = {}
         self._tasks = self._finished = 0
         self._said: set[str] = set()
 
@@ -58,29 +56,22 @@ class TasksDisplay:
             self._tasks += 1
             self._draw_whole()
 
-    def begin(self, number: int, name: str) -> None:
-        """Show a task that is begun."""
-        with self._lock:
-            self._lines[number] = self._progress.add_task(f"  {name}", total=None, text="", count="")
+    def begin(self, name: str) -> TaskID:
+        """Show a task that is begun; return its line."""
+        return self._progress.add_task(f"  {name}", total=None, text="", count="")
 
-    def advance(self, number: int, completed: int, total: int | None, text: str) -> None:
+    def advance(self, line: TaskID, completed: int, total: int | None, text: str) -> None:
         """Show how far a task is."""
-        with self._lock:
-            if number in self._lines:
-                count = f"{completed}/{total}" if total else str(completed)
-                self._progress.update(
-                    self._lines[number], completed=completed, total=total or None, text=text, count=count
-                )
-                self._shares[number] = min(1.0, completed / total) if total else 0.0
-                self._draw_whole()
+        count = f"{completed}/{total}" if total else str(completed)
+        self._progress.update(line, completed=completed, total=total or None, text=text, count=count)
+        self._draw_whole()
 
-    def end(self, number: int, *, finished: bool) -> None:
-        """Take a task away; it counts if it is finished."""
+    def end(self, line: TaskID | None = None) -> None:
+        """Count a task as finished, and take its line away if it has one."""
+        if line is not None:
+            self._progress.remove_task(line)
         with self._lock:
-            if number in self._lines:
-                self._progress.remove_task(self._lines.pop(number))
-            self._shares.pop(number, None)
-            self._finished += finished
+            self._finished += 1
             self._draw_whole()
 
     def say(self, text: str) -> None:
@@ -92,9 +83,10 @@ class TasksDisplay:
         print_plain(self._console, text)
 
     def _draw_whole(self) -> None:
+        running = [task.percentage for task in self._progress.tasks if task.id != self._whole]
         self._progress.update(
             self._whole,
-            completed=self._finished + sum(self._shares.values()),
+            completed=self._finished + sum(running) / 100.0,
             total=self._tasks,
             count=f"{self._finished}/{self._tasks}",
         )

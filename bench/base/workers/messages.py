@@ -3,31 +3,16 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import IO, Any
 
 
 @dataclass(frozen=True)
 class Welcome:
-    """What a worker process has to know: command line, width of the terminal, and modules; see `Workers`."""
+    """What a worker process has to know: command line, and width of the terminal. A task is `bytes`: its call."""
 
     command: list[str]
     width: int
-    modules: tuple[str, ...]
-    aside: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Order:
-    """A task: function, positional and keyword arguments; pickled, as a worker may be unable to read them."""
-
-    content: bytes
-
-    @classmethod
-    def of(cls, function: Callable[..., Any], arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Order:
-        """Return the order to call a function; raises what pickle raises if it cannot be sent."""
-        return cls(pickle.dumps((function, arguments, keywords)))
 
 
 @dataclass(frozen=True)
@@ -57,7 +42,7 @@ class Words:
 Message = Result | Progress | Words
 
 
-def send(pipe: IO[bytes], message: Message | Welcome | Order) -> None:
+def send(pipe: IO[bytes], message: Message | Welcome | bytes) -> None:
     """Write a message."""
     pickle.dump(message, pipe)
     pipe.flush()

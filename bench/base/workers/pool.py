@@ -9,18 +9,20 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from types import FrameType, TracebackType
-from typing import Any, Generic, ParamSpec, Self, TypeVar
+from typing import Any, ParamSpec, Self, TypeVar
 
 from rich.console import Console
 
 from bench.base.errors import AbortError, BenchError
+from bench.base.interrupts import signal_name
 from bench.base.workers.display import TasksDisplay
-from bench.base.workers.messages import Order, Progress, Result, Welcome, Words, receive, send
-from bench.base.workers.task import collecting_seldom, task_surroundings
+from bench.base.workers.messages import Progress, Result, Welcome, Words, receive, send
+from bench.base.workers.task import task_surroundings
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -33,12 +35,6 @@ _UNFINISHED = 40.0
 
 _LOOK = 0.5
 """Longest wait, s, during which Windows would not hear Ctrl-C."""
-
-_WORTH_LOADING = 8
-"""Tasks aside from which on a worker loads what they take, although another one has."""
-
-_AT_ONCE = 2
-"""Worker processes that are started before there is a task: work for several cores has two tasks at least."""
 
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
@@ -54,54 +50,36 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-class Pending(Generic[T]):
-    """The result of a task, sooner or later."""
+class Pending(Future[T]):
+    """The result of a task, sooner or later.
 
-    def __init__(
-        self,
-        workers: Workers,
-        number: int,
-        name: str,
-        call: Callable[[], T],
-        order: Order | None,
-        queue: deque[Pending[Any]],
-    ) -> None:
+    Its `exception()` and its `result()`, which raises that, wait for the task. It is a BenchError if the task ended
+    its worker process as often as it was begun.
+    """
+
+    def __init__(self, workers: Workers, name: str, call: partial[T]) -> None:
+        super().__init__()
         self.name = name
         self._workers = workers
-        self._number = number
         self._call = call
-        self._order = order
-        self._queue = queue
-        self._deaths = 0
-        self._is_done = False
+        self._order = b""
         self._was_asked = False
-        self._value: T | None = None
-        self._error: Exception | None = None
-
-    @property
-    def done(self) -> bool:
-        """Whether the task is finished."""
-        return self._is_done
-
-    @property
-    def error(self) -> Exception | None:
-        """What the task raised; None if it has not, or is not finished."""
-        self._was_asked |= self._is_done
-        return self._error
 
     def hurry(self) -> None:
-        """Have the task begun before all others of its kind that wait, as others depend on its result."""
+        """Have the task begun before all others that wait, as others depend on its result."""
         self._workers._put_first(self)
 
-    def result(self) -> T:
-        """Wait for the task; return what it returned, raise what it raised.
+    def result(self, timeout: float | None = None) -> T:
+        """Wait for the task; return what it returned, raise what it raised."""
+        self._workers.wait_for([self])
+        self._was_asked = True
+        return super().result(timeout)
 
-        Raises BenchError if it ended its worker process as often as it was begun.
-        """
-        self._workers._wait_for(self)
-        if self.error is not None:
-            raise self.error
-        return self._value  # type: ignore[return-value]  # what the task returned, which may be None
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        """Wait for the task; return what it raised, or None."""
+        self._workers.wait_for([self])
+        self._was_asked = True
+        return super().exception(timeout)
 
 
 class Workers:
@@ -116,9 +94,6 @@ class Workers:
     of workers, as each has one thread of BLAS; the order in which they are taken is the caller's. A task whose worker
     process dies is done again; a task during which three die fails.
 
-    The first two worker processes are started at once, any other when a task finds none that is free. They live until
-    the end.
-
     Parameters
     ----------
     number : int, optional
@@ -128,12 +103,6 @@ class Workers:
         Where to print and to draw the progress; without it nothing is shown.
     title : str
         What the tasks are together, for the progress.
-    modules : tuple of str
-        Modules that the tasks take. A worker process loads them before its first task, the first ones beside what
-        this process loads.
-    aside : tuple of str
-        Modules that the tasks aside take. The worker that has these in front loads them when it has nothing else to
-        do.
     kernels : tuple of str
         Packages whose kernels the tasks take, see `bench.base.compiled.kernels_of`. They are compiled in this process
         before a worker process is started, which would compile them once more.
@@ -144,25 +113,20 @@ class Workers:
         number: int | None = None,
         console: Console | None = None,
         title: str = "all",
-        modules: tuple[str, ...] = (),
-        aside: tuple[str, ...] = (),
         kernels: tuple[str, ...] = (),
     ) -> None:
         self.number = available_cores() if number is None else number
         self.in_process = self.number == 1
         self._console = Console(quiet=True) if console is None else console
         self._display = TasksDisplay(self._console, title)
-        self._modules, self._modules_aside = modules, aside
         self._kernels = kernels
-        self._ready: dict[int, _Worker] = {}
         self._changed = threading.Condition()
         self._tasks: list[Pending[Any]] = []
-        self._queue: deque[Pending[Any]] = deque()
-        self._aside: deque[Pending[Any]] = deque()
-        self._threads: list[threading.Thread] = []
-        self._processes: set[subprocess.Popen[bytes]] = set()
-        self._free = 0
-        self._is_held = False
+        self._waiting: deque[Pending[Any]] = deque()
+        # Each of its jobs carries out the task that is the first by then.
+        self._threads = ThreadPoolExecutor(self.number, "worker")
+        self._own = threading.local()
+        self._processes: set[_Worker] = set()
         self._is_closing = False
         self._stack = ExitStack()
 
@@ -173,14 +137,11 @@ class Workers:
                 if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:
                     former = signal.signal(getattr(signal, name), self._interrupt)
                     self._stack.callback(signal.signal, getattr(signal, name), former)
-        if not self.in_process:
-            self._compile()
-            self._ready = {number: self._start_worker(number) for number in range(min(_AT_ONCE, self.number))}
         self._stack.enter_context(_one_thread())
-        self._stack.enter_context(collecting_seldom())
         if self.in_process:
             self._stack.enter_context(task_surroundings(self._console, None))
         else:
+            self._compile()
             self._display.start()
             self._stack.callback(self._display.stop)
         return self
@@ -192,7 +153,7 @@ class Workers:
             try:
                 if kind is None:
                     for task in self._tasks:
-                        self._wait_for(task)
+                        self.wait_for([task])
                         if not task._was_asked:
                             task.result()
             finally:
@@ -205,11 +166,7 @@ class Workers:
 
             compile_kernels(self._kernels, self._console)
 
-    def submit(self, function: Callable[P, T], *arguments: P.args, **keywords: P.kwargs) -> Pending[T]:
-        """Have a function called; its name is that of the task, see `submit_as`."""
-        return self.submit_as(getattr(function, "__name__", "task"), function, *arguments, **keywords)
-
-    def submit_as(self, name: str, function: Callable[P, T], *arguments: P.args, **keywords: P.kwargs) -> Pending[T]:
+    def submit(self, name: str, function: Callable[P, T], *arguments: P.args, **keywords: P.kwargs) -> Pending[T]:
         """Have a function called.
 
         Parameters
@@ -226,184 +183,119 @@ class Workers:
         TypeError, AttributeError, pickle.PicklingError
             If function or arguments cannot be sent to a worker process.
         """
-        return self._submit(self._queue, name, partial(function, *arguments, **keywords))
-
-    def submit_aside(
-        self, name: str, function: Callable[P, T], *arguments: P.args, **keywords: P.kwargs
-    ) -> Pending[T]:
-        """Have a function called that nobody waits for; parameters and errors are those of `submit_as`.
-
-        One of the workers carries such tasks out before all others, and the rest only if nothing else is left and
-        several of them wait: what they load takes as long as several of them.
-        """
-        return self._submit(self._aside, name, partial(function, *arguments, **keywords))
-
-    def _submit(self, queue: deque[Pending[Any]], name: str, call: partial[T]) -> Pending[T]:
-        order = None
+        task = Pending(self, name, partial(function, *arguments, **keywords))
         if not self.in_process:
-            if getattr(call.func, "__module__", "") == "__main__":
-                raise TypeError(f"{name}: a worker process cannot import {call.func!r}; put it into a module")
-            order = Order.of(call.func, call.args, call.keywords)
-        task = Pending(self, len(self._tasks), name, call, order, queue)
+            if getattr(function, "__module__", "") == "__main__":
+                raise TypeError(f"{name}: a worker process cannot import {function!r}; put it into a module")
+            # By itself, as a worker may be unable to read it.
+            task._order = pickle.dumps(task._call)
         with self._changed:
             self._tasks.append(task)
-            queue.append(task)
-            self._changed.notify_all()
-            waiting = len(self._queue) + len(self._aside)
-            if not self.in_process and waiting > self._free and len(self._threads) < self.number:
-                self._free += 1
-                number = len(self._threads)
-                self._threads.append(threading.Thread(target=self._serve, args=(number,), name=f"worker-{number}"))
-                self._threads[-1].start()
+            self._waiting.append(task)
         self._display.add()
+        if not self.in_process:
+            self._threads.submit(self._carry_out_first)
         return task
 
-    @contextmanager
-    def together(self) -> Iterator[None]:
-        """Have no task begun within the block; then the one that was hurried is the first, whatever came before.
-
-        Nothing in the block may wait for a task.
-        """
-        with self._changed:
-            self._is_held = True
-        try:
-            yield
-        finally:
+    def wait_for(self, tasks: Collection[Pending[T]]) -> Pending[T]:
+        """Wait until one of some tasks is finished, and return it."""
+        while True:
             with self._changed:
-                self._is_held = False
-                self._changed.notify_all()
-
-    def as_completed(self, tasks: Iterable[Pending[T]]) -> Iterator[Pending[T]]:
-        """Yield tasks as they are finished, those that raised as well.
-
-        Raises AbortError if a task did, as the operator ended it.
-        """
-        left = list(tasks)
-        while left:
-            if self.in_process:
-                self._wait_for(left[0])
-            with self._changed:
-                while not (done := [task for task in left if task.done]):
+                while (done := next((task for task in tasks if task.done()), None)) is None and not self.in_process:
                     self._changed.wait(_LOOK)
-            for task in done:
-                left.remove(task)
-                if isinstance(task.error, AbortError):
-                    raise task.error
-                yield task
+            if done is not None:
+                return done
+            self._carry_out_here(self._waiting.popleft())
 
     def _put_first(self, task: Pending[Any]) -> None:
         with self._changed:
-            if task in task._queue:
-                task._queue.remove(task)
-                task._queue.appendleft(task)
-
-    def _wait_for(self, task: Pending[Any]) -> None:
-        if self.in_process:
-            while not task.done:
-                self._carry_out_here((self._queue or self._aside).popleft())
-        with self._changed:
-            while not task.done:
-                self._changed.wait(_LOOK)
+            if task in self._waiting:
+                self._waiting.remove(task)
+                self._waiting.appendleft(task)
 
     def _carry_out_here(self, task: Pending[Any]) -> None:
         try:
-            task._value = task._call()
+            task.set_result(task._call())
         except AbortError:
             raise
         except Exception as error:
-            task._error = error
-        task._is_done = True
+            task.set_exception(error)
 
-    def _serve(self, number: int) -> None:
-        """Have one worker process carry out task after task; another if it dies."""
-        worker = self._ready.pop(number, None)
-        while (task := self._take(number)) is not None:
-            self._display.begin(task._number, task.name)
+    def _carry_out_first(self) -> None:
+        """Have the first task that waits carried out by the worker process of this thread; by another if it dies."""
+        with self._changed:
+            task = self._waiting.popleft()
+        line = self._display.begin(task.name)
+        cause = ""
+        for _ in range(ATTEMPTS):
             try:
-                worker = worker or self._start_worker(number)
-                result = worker.carry_out(task, self._display)
+                worker = self._own_worker()
+                result = worker.carry_out(task._order, partial(self._display.advance, line), self._display.say)
+                break
             except (EOFError, OSError) as death:
-                finished = self._mourn(task, death if worker is None else worker.cause_of_death())
-                worker = None
-            else:
-                finished = True
-                self._finish(task, *_unpacked(result))
-            self._display.end(task._number, finished=finished)
-        if worker is not None:
-            worker.close()
+                if self._is_closing:
+                    return
+                cause = self._mourn() or str(death)
+        else:
+            error = BenchError(f"{task.name}: its worker process died {ATTEMPTS} times, the last time by {cause}")
+            result = Result(pickle.dumps(error), is_error=True)
+        try:
+            content = pickle.loads(result.content)  # noqa: S301 - from our own process
+        except Exception as error:
+            result, content = Result(b"", is_error=True), error
+        if result.is_error:
+            task.set_exception(content)
+        else:
+            task.set_result(content)
+        self._display.end(line)
+        with self._changed:
+            self._changed.notify_all()
 
-    def _start_worker(self, number: int) -> _Worker:
+    def _own_worker(self) -> _Worker:
+        """Return the worker process of this thread."""
         with self._changed:
             # After the end has begun nobody would end it.
             if self._is_closing:
-                raise EOFError("the end of all workers")
-            # Beside what they load, the loops of a run are some percent slower.
-            aside = self._modules_aside if number == 0 else ()
-            return _Worker(Welcome(sys.argv, self._console.width, self._modules, aside), self._processes)
+                raise EOFError
+            if not hasattr(self._own, "worker"):
+                self._own.worker = _Worker(Welcome(sys.argv, self._console.width))
+                self._processes.add(self._own.worker)
+        worker: _Worker = self._own.worker
+        return worker
 
-    def _take(self, number: int) -> Pending[Any] | None:
-        """Return the next task of a worker, when there is one; None at the end."""
-        with self._changed:
-            while (queue := self._next_queue(number)) is None and not self._is_closing:
-                self._changed.wait()
-            if queue is None or self._is_closing:
-                return None
-            self._free -= 1
-            return queue.popleft()
-
-    def _next_queue(self, number: int) -> deque[Pending[Any]] | None:
-        """Return where the next task of a worker is; the first worker has those aside in front."""
-        if self._is_held:
-            return None
-        if self._aside and number == 0:
-            return self._aside
-        if self._queue:
-            return self._queue
-        return self._aside if len(self._aside) >= _WORTH_LOADING else None
-
-    def _mourn(self, task: Pending[Any], cause: object) -> bool:
-        """Have the task of a dead worker process done again; return whether it has failed instead."""
-        with self._changed:
-            task._deaths += 1
-            if task._deaths < ATTEMPTS and not self._is_closing:
-                task._queue.appendleft(task)
-                self._free += 1
-                self._changed.notify_all()
-                return False
-        error = f"{task.name}: its worker process died {task._deaths} times, the last time by {cause}"
-        self._finish(task, None, BenchError(error))
-        return True
-
-    def _finish(self, task: Pending[Any], value: object, error: Exception | None) -> None:
-        with self._changed:
-            task._value, task._error, task._is_done = value, error, True
-            self._free += 1
-            self._changed.notify_all()
+    def _mourn(self) -> str:
+        """Forget the worker process of this thread; return what ended it, or nothing if it could not be started."""
+        worker: _Worker | None = vars(self._own).pop("worker", None)
+        if worker is None:
+            return ""
+        self._processes.discard(worker)
+        return worker.cause_of_death()
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - signal's form
         if self._is_closing:
             for process in list(self._processes):
                 process.kill()
             return
-        reason = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        reason = "Ctrl-C" if number == signal.SIGINT else signal_name(number)
         raise AbortError(f"ended by {reason}")
 
     def _close(self) -> None:
         """End all worker processes, and wait for their ends."""
         with self._changed:
             self._is_closing = True
-            self._changed.notify_all()
-        for process in list(self._processes):
-            _hang_up(process)
-        for process in list(self._processes):
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        processes = list(self._processes)
+        for process in processes:
+            process.hang_up()
+        for process in processes:
             try:
                 process.wait(_UNFINISHED)
             except subprocess.TimeoutExpired:
                 process.kill()
-        for thread in self._threads:
-            thread.join()
-        for worker in self._ready.values():
-            worker.close()
+        self._threads.shutdown()
+        for process in processes:
+            process.cause_of_death()
+        self._processes.clear()
 
 
 def _one_thread() -> AbstractContextManager[object]:
@@ -416,86 +308,58 @@ def _one_thread() -> AbstractContextManager[object]:
     return limit
 
 
-class _Worker:
+class _Worker(subprocess.Popen[bytes]):
     """One worker process.
 
     Parameters
     ----------
     welcome : Welcome
         What it has to know.
-    processes : set
-        Where it is entered while it lives.
     """
 
-    def __init__(self, welcome: Welcome, processes: set[subprocess.Popen[bytes]]) -> None:
+    def __init__(self, welcome: Welcome) -> None:
         # The modules of the tasks have to be found as here; -P keeps the working folder out of the way of ours.
         path = os.pathsep.join(entry for entry in sys.path if entry)
-        self._process = subprocess.Popen(
+        # The terminal's signals are for this process, which ends the others.
+        group: dict[str, Any] = {"process_group": 0}
+        if sys.platform == "win32":
+            group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+        super().__init__(
             [sys.executable, "-P", "-m", "bench.base.workers"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **_ONE_THREAD, "PYTHONPATH": path},
-            # The terminal's signals are for this process, which ends the others.
-            **_own_group(),
+            **group,
         )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._orders, self._results = self._process.stdin, self._process.stdout
-        self._processes = processes
-        processes.add(self._process)
+        assert self.stdin is not None
+        assert self.stdout is not None
+        self._orders, self._results = self.stdin, self.stdout
         with suppress(OSError):
             send(self._orders, welcome)
 
-    def carry_out(self, task: Pending[Any], display: TasksDisplay) -> Result:
-        """Return the result of a task; show what comes before it.
+    def carry_out(
+        self, order: bytes, advance: Callable[[int, int | None, str], None], say: Callable[[str], None]
+    ) -> Result:
+        """Return the result of a task; hand on how far it is and what it says before.
 
         Raises EOFError or OSError if the process is gone.
         """
-        assert task._order is not None
-        send(self._orders, task._order)
+        send(self._orders, order)
         while not isinstance(message := receive(self._results), Result):
             if isinstance(message, Progress):
-                display.advance(task._number, message.completed, message.total, message.text)
+                advance(message.completed, message.total, message.text)
             elif isinstance(message, Words):
-                display.say(message.text)
+                say(message.text)
         return message
 
+    def hang_up(self) -> None:
+        """Close its standard input, which asks it to end."""
+        with suppress(OSError, ValueError):
+            self._orders.close()
+
     def cause_of_death(self) -> str:
-        """Wait for the end of the process; return what ended it."""
-        self.close()
-        code = self._process.returncode
-        if code >= 0:
-            return f"exit code {code}"
-        try:
-            return signal.Signals(-code).name
-        except ValueError:
-            return f"signal {-code}"
-
-    def close(self) -> None:
-        """Wait for the end of the process, and close the pipes."""
-        _hang_up(self._process)
-        self._process.wait()
+        """Wait for the end of the process, and close the pipes; return what ended it."""
+        self.hang_up()
+        code = self.wait()
         self._results.close()
-        self._processes.discard(self._process)
-
-
-def _hang_up(process: subprocess.Popen[bytes]) -> None:
-    """Close a worker's standard input, which asks it to end."""
-    assert process.stdin is not None
-    with suppress(OSError, ValueError):
-        process.stdin.close()
-
-
-def _own_group() -> dict[str, Any]:
-    if sys.platform == "win32":
-        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
-    return {"process_group": 0}
-
-
-def _unpacked(result: Result) -> tuple[object, Exception | None]:
-    """Return what a task returned and what it raised."""
-    try:
-        content = pickle.loads(result.content)  # noqa: S301 - from our own process
-    except Exception as error:
-        return None, error
-    return (None, content) if result.is_error else (content, None)
+        return f"exit code {code}" if code >= 0 else signal_name(-code)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,13 +9,6 @@ from dataclasses import dataclass
 from rich.console import Console
 
 Report = Callable[[int, int | None, str], None]
-
-_COLLECTIONS = 100_000, 20, 50
-"""Thresholds of the garbage collection, see `gc.set_threshold`.
-
-A task loads hundreds of thousands of objects that stay, and makes rows by the thousand that are no garbage. With
-Python's own thresholds, looking through them takes a quarter of the time of an export.
-"""
 
 
 @dataclass(frozen=True)
@@ -37,17 +29,6 @@ def task_surroundings(console: Console, report: Report | None) -> Iterator[None]
         yield
     finally:
         _surroundings = former
-
-
-@contextmanager
-def collecting_seldom() -> Iterator[None]:
-    """Look for garbage seldom."""
-    former = gc.get_threshold()
-    gc.set_threshold(*_COLLECTIONS)
-    try:
-        yield
-    finally:
-        gc.set_threshold(*former)
 
 
 def task_console() -> Console:

@@ -119,7 +119,7 @@ class ClusterExecutor:
         """Wait for a task, and put its folder where it belongs."""
         future = next(self._completed)
         task = self._tasks.pop(future.key)
-        self._display.end(len(self._tasks), finished=True)
+        self._display.end()
         if future.status != "finished":
             return task, settled(task, future.exception(), None)
         done, content = future.result()

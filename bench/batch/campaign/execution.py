@@ -9,7 +9,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Protocol
 
-from bench.base import BenchError, ConfigurationError, Pending, Workers
+from bench.base import AbortError, BenchError, ConfigurationError, Pending, Workers
 from bench.batch.campaign.tasks import DONE_NAME, SHOWN_DIGITS, UNFINISHED, CampaignTask, Done
 from bench.rig import Holder, Locks
 
@@ -45,13 +45,15 @@ class WorkersExecutor:
 
     def submit(self, task: CampaignTask) -> None:
         """Have a task carried out."""
-        self._pending[self._workers.submit_as(task.name, task.carry_out, self._campaign)] = task
+        self._pending[self._workers.submit(task.name, task.carry_out, self._campaign)] = task
 
     def next_done(self) -> tuple[CampaignTask, Done]:
         """Wait for a task."""
-        pending = next(iter(self._workers.as_completed(self._pending)))
-        task = self._pending.pop(pending)
-        return task, settled(task, pending.error, None if pending.error else pending.result())
+        pending = self._workers.wait_for(self._pending)
+        task, error = self._pending.pop(pending), pending.exception()
+        if isinstance(error, AbortError):
+            raise error
+        return task, settled(task, error, None if error else pending.result())
 
 
 def settled(task: CampaignTask, error: BaseException | None, done: Done | None) -> Done:

@@ -55,7 +55,7 @@ def workers(text):
 def test_a_task_in_a_hurry_is_begun_before_all_that_wait(text):
     begun = []
     with Workers(1, Console(file=text)) as alone:
-        first, second, third = (alone.submit(begun.append, name) for name in ("first", "second", "third"))
+        first, second, third = (alone.submit(name, begun.append, name) for name in ("first", "second", "third"))
         third.hurry()
         first.result()
         assert begun == ["third", "first"]
@@ -65,59 +65,27 @@ def test_a_task_in_a_hurry_is_begun_before_all_that_wait(text):
     assert begun == ["third", "first", "second"]
 
 
-def test_of_tasks_submitted_together_the_one_in_a_hurry_is_the_first_although_workers_are_free(tmp_path):
+def test_a_task_in_a_hurry_is_the_next_of_a_worker_process(tmp_path):
     with Workers(2) as workers:
         # One of the two has something to do until the end.
-        waiting = workers.submit(worker_tasks.meet, tmp_path)
-        with workers.together():
-            tasks = [workers.submit(worker_tasks.ordinal) for _ in range(3)]
-            tasks[2].hurry()
-            assert not any(task.done for task in tasks)
-        first, second, third = (task.result() for task in tasks)
-        assert third < first < second
-        workers.submit(worker_tasks.meet, tmp_path).result()
+        waiting = workers.submit("meet", worker_tasks.meet, tmp_path)
+        tasks = [workers.submit("ordinal", worker_tasks.ordinal) for _ in range(10)]
+        tasks[-1].hurry()
+        # The first one may have been begun.
+        assert tasks[-1].result() <= 1
+        assert tasks[1].result() == 2
+        workers.submit("meet", worker_tasks.meet, tmp_path).result()
         waiting.result()
-
-
-def test_one_worker_loads_what_tasks_aside_take_while_there_is_none():
-    with Workers(2, aside=("no_such_module", "wave")) as workers:
-        wait_until(lambda: workers.submit_aside("aside", worker_tasks.is_loaded, "wave").result())
-
-
-def test_the_first_worker_has_loaded_modules_before_its_tasks():
-    with Workers(2, modules=("no_such_module", "wave")) as workers:
-        assert workers.submit(worker_tasks.is_loaded, "wave").result()
-        assert not workers.submit(worker_tasks.is_loaded, "netrc").result()
 
 
 def test_workers_without_a_task_end():
     with Workers(2) as workers:
-        processes = list(workers._processes)
-    assert len(processes) == 2
-    assert all(process.returncode is not None for process in processes)
+        pass
     assert not workers._processes
 
 
-def test_what_is_aside_comes_first_for_one_worker_and_last_for_one_alone(workers):
-    tasks = [workers.submit(worker_tasks.process, value) for value in range(20)]
-    aside = [workers.submit_aside("aside", worker_tasks.process, value) for value in range(3)]
-    assert len({task.result()[1] for task in aside}) == 1
-    assert {task.result()[0] for task in tasks} == set(range(20))
-    begun = []
-    with Workers(1) as alone:
-        alone.submit_aside("aside", begun.append, "aside")
-        alone.submit(begun.append, "task")
-    assert begun == ["task", "aside"]
-
-
-def test_much_that_is_aside_is_for_all_workers(workers, tmp_path):
-    # One alone would wait for ever.
-    for task in [workers.submit_aside("aside", worker_tasks.meet, tmp_path) for _ in range(10)]:
-        task.result()
-
-
 def test_results_come_in_the_order_in_which_they_are_taken_from_processes_that_go_on(workers):
-    tasks = [workers.submit(worker_tasks.process, value) for value in range(20)]
+    tasks = [workers.submit("process", worker_tasks.process, value) for value in range(20)]
     results = [task.result() for task in tasks]
     assert [value for value, _ in results] == list(range(20))
     processes = {number for _, number in results}
@@ -126,46 +94,50 @@ def test_results_come_in_the_order_in_which_they_are_taken_from_processes_that_g
 
 
 def test_results_come_as_tasks_finish(workers):
-    tasks = [workers.submit(worker_tasks.process, value) for value in range(5)]
-    assert {task.result()[0] for task in workers.as_completed(tasks)} == set(range(5))
+    tasks = [workers.submit("process", worker_tasks.process, value) for value in range(5)]
+    found = set()
+    while tasks:
+        found.add((done := workers.wait_for(tasks)).result()[0])
+        tasks.remove(done)
+    assert found == set(range(5))
 
 
 def test_a_result_is_the_same_in_a_worker_as_here(workers):
     with Workers(1) as alone:
-        here = alone.submit(worker_tasks.product, 300).result()
-    assert np.array_equal(workers.submit(worker_tasks.product, 300).result(), here)
+        here = alone.submit("product", worker_tasks.product, 300).result()
+    assert np.array_equal(workers.submit("product", worker_tasks.product, 300).result(), here)
 
 
 def test_what_a_task_says_is_printed_and_what_it_prints_does_no_harm(workers, text):
-    workers.submit(worker_tasks.speak, "a word of it").result()
+    workers.submit("speak", worker_tasks.speak, "a word of it").result()
     wait_until(lambda: "a word of it is said\n" in text.getvalue())
     assert "not for the bench" not in text.getvalue()
 
 
 def test_an_error_of_the_bench_comes_back_as_it_is(workers):
     with pytest.raises(DeviceError, match=r"^tec: answers with an error$") as caught:
-        workers.submit(worker_tasks.fail, "tec").result()
+        workers.submit("fail", worker_tasks.fail, "tec").result()
     assert caught.value.device == "tec"
     assert not hasattr(caught.value, "__notes__")
 
 
 def test_a_defect_comes_back_with_its_traceback(workers):
     with pytest.raises(ValueError, match="a defect") as caught:
-        workers.submit(worker_tasks.break_down).result()
+        workers.submit("break_down", worker_tasks.break_down).result()
     assert "in break_down" in caught.value.__notes__[0]
 
 
 def test_the_task_of_a_killed_worker_is_done_again_twice(workers, tmp_path):
     for name in "ab":
         (tmp_path / name).touch()
-    assert workers.submit(worker_tasks.die, tmp_path).result() == "done"
+    assert workers.submit("die", worker_tasks.die, tmp_path).result() == "done"
 
 
 def test_a_task_that_kills_three_workers_fails_and_the_others_go_on(workers, tmp_path):
     for name in "abcd":
         (tmp_path / name).touch()
-    deadly = workers.submit_as("the deadly one", worker_tasks.die, tmp_path)
-    others = [workers.submit(worker_tasks.process, value) for value in range(5)]
+    deadly = workers.submit("the deadly one", worker_tasks.die, tmp_path)
+    others = [workers.submit("process", worker_tasks.process, value) for value in range(5)]
     assert [task.result()[0] for task in others] == list(range(5))
     with pytest.raises(BenchError, match=r"^the deadly one: its worker process died 3 times, the last time by "):
         deadly.result()
@@ -174,27 +146,27 @@ def test_a_task_that_kills_three_workers_fails_and_the_others_go_on(workers, tmp
 
 def test_a_function_that_cannot_be_sent_is_refused_at_once(workers):
     with pytest.raises((pickle.PicklingError, AttributeError)):
-        workers.submit(lambda: 1)
+        workers.submit("none", lambda: 1)
 
 
 def test_a_function_of_a_script_is_refused_at_once(workers, monkeypatch):
     monkeypatch.setattr(worker_tasks.process, "__module__", "__main__")
     with pytest.raises(TypeError, match="put it into a module"):
-        workers.submit(worker_tasks.process, 1)
+        workers.submit("process", worker_tasks.process, 1)
 
 
 def test_one_worker_is_this_process():
     with Workers(1) as workers:
-        assert workers.submit(worker_tasks.process, 1).result() == (1, os.getpid())
-        late = workers.submit(worker_tasks.process, 2)
-        assert not late.done
+        assert workers.submit("process", worker_tasks.process, 1).result() == (1, os.getpid())
+        late = workers.submit("process", worker_tasks.process, 2)
+        assert not late.done()
     assert late.result() == (2, os.getpid())
 
 
 @cases("number", [1, 2])
 def test_the_end_raises_what_nobody_has_asked_for(number):
     with pytest.raises(DeviceError), Workers(number) as workers:
-        workers.submit(worker_tasks.fail, "tec")
+        workers.submit("fail", worker_tasks.fail, "tec")
 
 
 def test_a_terminal_shows_each_task_that_runs_and_how_many_are_finished():
@@ -203,10 +175,10 @@ def test_a_terminal_shows_each_task_that_runs_and_how_many_are_finished():
     for _ in range(3):
         display.add()
     display.start()
-    display.begin(0, "tracking controller=latched")
-    display.begin(1, "creep")
-    display.advance(0, 3, 60, "curvature 12.5 1/m")
-    display.end(1, finished=True)
+    first = display.begin("tracking controller=latched")
+    second = display.begin("creep")
+    display.advance(first, 3, 60, "curvature 12.5 1/m")
+    display.end(second)
     display.stop()
     last = text.getvalue().rpartition("study")[2]
     assert "1/3" in last
@@ -223,7 +195,7 @@ def test_an_exception_ends_all_processes(tmp_path):
     def leave():
         with Workers(2) as workers:
             for _ in range(3):
-                workers.submit(worker_tasks.wait, tmp_path)
+                workers.submit("wait", worker_tasks.wait, tmp_path)
             wait_until(lambda: len(list(tmp_path.iterdir())) == 2)
             raise KeyError
 
@@ -235,7 +207,7 @@ def test_an_exception_ends_all_processes(tmp_path):
 def test_a_signal_ends_the_runs_in_their_safe_state(tmp_path):
     def interrupt():
         with Workers(2) as workers:
-            runs = [workers.submit(worker_tasks.run, tmp_path) for _ in range(2)]
+            runs = [workers.submit("run", worker_tasks.run, tmp_path) for _ in range(2)]
             wait_until(lambda: len(list(tmp_path.glob("*/journal.sqlite-wal"))) == 2)
             signal.raise_signal(signal.SIGINT)
             runs[0].result()
