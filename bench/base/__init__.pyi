@@ -94,6 +94,7 @@ from .parsing import (
     write_json_file as write_json_file,
 )
 from .patience import (
+    PatienceDisplay as PatienceDisplay,
     say_share as say_share,
     shares_to as shares_to,
     show_patience as show_patience,

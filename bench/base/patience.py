@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from threading import Event, Thread
 from typing import TypeAlias
 
 from rich.console import Console
-from rich.errors import LiveError
+
+from bench.base.printing import print_plain
 
 Listener: TypeAlias = Callable[[str, float], None]
 """Takes what is being done, such as `fitting`, and the share of it that is done, 0 to 1."""
@@ -53,7 +54,7 @@ PATIENCE = 2.0
 class PatienceDisplay:
     """A bar with the time that has passed and the time that is left, as far as what computes says its share.
 
-    Nothing is drawn if the console is no terminal, nor in the first seconds.
+    Nothing is drawn in the first seconds. If the console is no terminal, what is done is printed once in its place.
 
     Parameters
     ----------
@@ -68,9 +69,12 @@ class PatienceDisplay:
     def __init__(self, text: str, console: Console, patience: float = PATIENCE) -> None:
         # Not at the start of each command: most show no bar.
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.table import Column
 
+        self._console = console
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            # Names are the user's: no markup, and none is cut.
+            TextColumn("{task.description}", markup=False, table_column=Column(overflow="fold")),
             BarColumn(),
             TimeElapsedColumn(),
             TextColumn("left, about:"),
@@ -104,12 +108,17 @@ class PatienceDisplay:
         done = self._progress.tasks[0].completed
         self._progress.update(self._task, completed=max(share, done), description=f"{self._text}: {stage}")
 
+    def describe(self, text: str) -> None:
+        """Show how far the work is where nothing says its share."""
+        self._progress.update(self._task, description=f"{self._text}: {text}")
+
     def _draw_later(self) -> None:
-        # Not while kernels are compiled, which is drawn on the same console.
-        while not self._done.wait(self._patience):
-            with suppress(LiveError):
-                self._progress.start()
-                return
+        if self._done.wait(self._patience):
+            return
+        if self._console.is_terminal:
+            self._progress.start()
+        else:
+            print_plain(self._console, f"{self._text} …")
 
 
 @contextmanager

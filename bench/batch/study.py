@@ -220,7 +220,7 @@ def _carry_out(protocol: str, **asked: Any) -> RunResult:  # noqa: ANN401 - fiel
     console = task_console()
     # The recording is made from the journal afterwards, when the density is known and can be drawn with it.
     run = Run(protocol=find_protocol(protocol), clock="virtual", recording=False, **asked)
-    with CompilationDisplay(console, console):
+    with CompilationDisplay(console):
         result = carry_out(run, console)
     if result.outcome.error is not None:
         raise result.outcome.error
@@ -421,7 +421,7 @@ def reproduce(
         # Not before: a worker process loads its modules meanwhile.
         from bench.base import CompilationDisplay
 
-        with CompilationDisplay(console, console):
+        with CompilationDisplay(console):
             on = rig or study.rig or ""
             campaign = RunSeries(on, folder, seed, live, pool, figure_format, recorded, settings)
             found = study.carry_out(campaign)

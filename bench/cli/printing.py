@@ -37,7 +37,7 @@ def show_compilation() -> Iterator[None]:
     # Here, as numba takes half a second to load.
     from bench.base import CompilationDisplay
 
-    with CompilationDisplay(console, error_console):
+    with CompilationDisplay(error_console):
         yield
 
 

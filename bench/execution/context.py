@@ -467,7 +467,7 @@ def _rehearsed(
             soft_wrap=True,
         )
         return None
-    with RehearsalDisplay(console, f"rehearsing {run.protocol.name} on {twin.name}") as display:
+    with RehearsalDisplay(f"rehearsing {run.protocol.name} on {twin.name}", console) as display:
         return rehearse(
             run.protocol,
             parameters,

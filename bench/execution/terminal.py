@@ -12,20 +12,19 @@ from typing import Self
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.control import Control
-from rich.errors import LiveError
-from rich.progress import Progress, SpinnerColumn, Task, TaskID, TextColumn
+from rich.progress import Progress, Task, TaskID
 from rich.progress_bar import ProgressBar
 from rich.segment import ControlType
-from rich.table import Column, Table
+from rich.table import Table
 from rich.text import Text
 
 from bench.base import (
     Expectation,
+    PatienceDisplay,
     Remaining,
     RemainingTime,
     Stopwatch,
     format_duration,
-    print_plain,
     report,
     say_at_once,
     wall_time,
@@ -35,10 +34,6 @@ from bench.record import Event, StepRecord
 
 _REFRESH = 0.1
 """Wall-clock seconds between two redraws of the readings."""
-
-_UNSEEN = 2.0
-"""Longest rehearsal that needs no display, s of wall-clock time."""
-
 
 _GAP = "  "
 """Between two parts of the progress of a run."""
@@ -297,35 +292,24 @@ def say_what_ctrl_c_does(text: str) -> None:
     say_at_once("ending the rehearsal; nothing has moved" if _rehearsing.is_set() else text)
 
 
-class RehearsalDisplay:
+class RehearsalDisplay(PatienceDisplay):
     """Shows from its third second on that a rehearsal goes on, and how far; an `Observer` of the engine.
 
     Parameters
     ----------
-    console : Console
-        Console to draw on; if it is no terminal, one line is printed.
     title : str
         What is rehearsed, and where.
+    console : Console
+        Console to draw on; if it is no terminal, one line is printed.
     """
 
-    def __init__(self, console: Console, title: str) -> None:
-        self._console = console
-        self._title = title
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}", markup=False, table_column=Column(overflow="fold")),
-            TextColumn("{task.fields[times]}", style="green", markup=False, table_column=Column(overflow="fold")),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._progress.add_task(title, total=None, times="")
-        self._since_start = Stopwatch()
+    def __init__(self, title: str, console: Console) -> None:
+        super().__init__(title, console)
         self._since_redraw = Stopwatch()
-        self._shown = False
 
     def __enter__(self) -> Self:
         _rehearsing.set()
+        self.start()
         return self
 
     def __exit__(
@@ -335,21 +319,13 @@ class RehearsalDisplay:
         if kind is None:
             _rehearsing.clear()
         with suppress(OSError):
-            self._progress.stop()
+            self.stop()
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:  # noqa: ARG002 - as of all
         """Show how far it is."""
-        if self._since_redraw.seconds() < _REFRESH:
-            return
-        self._since_redraw = Stopwatch()
-        if not self._shown and self._since_start.seconds() > _UNSEEN:
-            self._shown = True
-            if not self._console.is_terminal:
-                print_plain(self._console, f"{self._title} …")
-            # A compilation draws on the same console.
-            with suppress(LiveError):
-                self._progress.start()
-        self._progress.update(self._task, times=f"{step} steps, laboratory {format_duration(t)}")
+        if self._since_redraw.seconds() > _REFRESH:
+            self._since_redraw = Stopwatch()
+            self.describe(f"{step} steps, laboratory {format_duration(t)}")
 
     def step(self, record: StepRecord) -> None:
         """Show how far it is."""
