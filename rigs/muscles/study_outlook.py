@@ -56,7 +56,6 @@ STUDY = Study(
         "bench.models.kernels.actuator_kernels",
         "bench.models.kernels.stream_kernels",
         "sim_devices.plants._friction_kernels",
-        "sim_devices.instruments._flintec_kernels",
         "sim_devices.transducers._imperfect_kernels",
     ),
 )

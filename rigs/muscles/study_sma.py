@@ -259,7 +259,6 @@ STUDY = Study(
         "bench.models.kernels.stream_kernels",
         "bench.models.kernels.actuator_kernels",
         "sim_devices.plants._sma_kernels",
-        "sim_devices.instruments._flintec_kernels",
         "sim_devices.transducers._imperfect_kernels",
     ),
 )

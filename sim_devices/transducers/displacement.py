@@ -36,12 +36,11 @@ class DisplacementSensor:
     """Source of the noise."""
 
     def __post_init__(self) -> None:
-        self.draw: Callable[[], float] = normals(self.rng).__next__
-        """Gives the next number of the standard normal distribution, for the noise of a conversion."""
+        self._draw: Callable[[], float] = normals(self.rng).__next__
         # Compiled before a driver waits for an answer.
         kernels.displacement_volts(0.0, self.resolution, self.reach, self.volts_per_metre)
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""
-        noisy = self.displacement() + self.noise * self.draw()
+        noisy = self.displacement() + self.noise * self._draw()
         return float(kernels.displacement_volts(noisy, self.resolution, self.reach, self.volts_per_metre))
