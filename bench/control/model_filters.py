@@ -118,6 +118,8 @@ class ModelFilter(ABC):
         self.identified = identified
         self._spans = Spans.of(identified)
         self.taken = self.refused = self.restarts = 0
+        # Stays when the adaptation begins again, so that it does not believe readings that err as much as before.
+        self._excess = 1.0
         self._begin()
 
     def _begin(self) -> None:
@@ -129,7 +131,6 @@ class ModelFilter(ABC):
         self._start, self._first = self._prior()
         self._filter = kalman.ExtendedKalmanFilter(dim_x=self._start.size, dim_z=1)
         self._filter.x, self._filter.P = self._start, self._first
-        self._excess = 1.0
 
     @abstractmethod
     def _prior(self) -> tuple[Floats, Floats]:
