@@ -19,7 +19,6 @@ from .by_name import (
 )
 from .choose.cross_validation import (
     CrossValidation as CrossValidation,
-    SmoothingTrial as SmoothingTrial,
     cross_validate as cross_validate,
 )
 from .choose.rule import (

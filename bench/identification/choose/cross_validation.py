@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats
 from bench.identification.by_name import Initial, set_up_problem
-from bench.identification.choose.splits import FOLDS, SMOOTHING_BLOCKS, Flags, Fold, block_folds
+from bench.identification.choose.splits import FOLDS, SMOOTHING_BLOCKS, Fold, block_folds
 from bench.identification.fit.least_squares import Fit, counted_weights
 from bench.identification.fit.orientation import Orientation
+from bench.identification.fit.regularization import Regularization
 from bench.models import Regressor
 
 EQUAL = 1.02
@@ -26,43 +27,18 @@ FitOf: TypeAlias = Callable[[float, Floats], Fit]
 
 
 @dataclass(frozen=True)
-class SmoothingTrial:
-    """One row of a cross-validation table.
-
-    Parameters
-    ----------
-    smoothing : float
-        Weight of the roughness penalty.
-    levels : int or None
-        Number of intervals; None if it was not varied.
-    rms : float
-        RMS error over all samples, each predicted by the model fitted without its fold, output units.
-    spread : float
-        Standard error of `rms`, from the scatter of the folds.
-    training_rms : float
-        RMS error over the samples that were fitted, mean over the folds.
-    """
-
-    smoothing: float
-    levels: int | None
-    rms: float
-    spread: float
-    training_rms: float
-
-
-@dataclass(frozen=True)
 class CrossValidation:
     """A table of trials, in the order asked for."""
 
-    trials: tuple[SmoothingTrial, ...]
+    trials: tuple[Regularization, ...]
 
     @property
-    def best(self) -> SmoothingTrial:
+    def best(self) -> Regularization:
         """The trial of the least error on samples left out."""
         return min(self.trials, key=lambda trial: trial.rms)
 
     @property
-    def smoothest(self) -> SmoothingTrial:
+    def smoothest(self) -> Regularization:
         """The trial of the greatest smoothing whose error does not differ from the least."""
         near = EQUAL * self.best.rms
         return max((trial for trial in self.trials if trial.rms <= near), key=lambda trial: trial.smoothing)
@@ -118,7 +94,7 @@ def cross_validate(
     """
     if levels is not None and not len(levels):
         raise ValueError("levels: expected at least one number, got none")
-    trials: list[SmoothingTrial] = []
+    trials: list[Regularization] = []
     for order in levels if levels is not None else [None]:
         chosen = options if order is None else {**options, "levels": order}
         problem = set_up_problem(
@@ -129,7 +105,7 @@ def cross_validate(
 
         fit = partial(problem.fit, ridge=ridge)
         compared = compare_smoothing(fit, problem.regressor, problem.outputs, counts, smoothing)
-        trials += [replace(trial, levels=order) for trial in compared.trials]
+        trials += [replace(trial, ridge=ridge, levels=order) for trial in compared.trials]
     return CrossValidation(tuple(trials))
 
 
@@ -172,23 +148,12 @@ def _trial(
     outputs: Floats,
     weights: Floats,
     parts: Sequence[Fold],
-) -> SmoothingTrial:
+) -> Regularization:
     """Return how well fits predict what was left out of them."""
-    squares, rms, training = np.zeros(outputs.size), [], []
-    for part in parts:
+    squares, counts, training = np.empty((3, len(parts)))
+    for k, part in enumerate(parts):
         found = fit(smoothing, np.where(part.tested, 0.0, weights))
         errors = (outputs - found.bias - regressor.product(found.coefficients)) ** 2
-        squares[part.tested] = errors[part.tested]
-        rms.append(_rms(errors, weights, part.tested))
-        training.append(_rms(errors, weights, part.trained))
-    return SmoothingTrial(
-        smoothing=float(smoothing),
-        levels=None,
-        rms=_rms(squares, weights, weights > 0.0),
-        spread=float(np.std(rms, ddof=1) / np.sqrt(len(rms))),
-        training_rms=float(np.mean(training)),
-    )
-
-
-def _rms(squares: Floats, weights: Floats, rows: Flags) -> float:
-    return float(np.sqrt(np.average(squares[rows], weights=weights[rows])))
+        squares[k], counts[k] = weights[part.tested] @ errors[part.tested], weights[part.tested].sum()
+        training[k] = np.sqrt(np.average(errors[part.trained], weights=weights[part.trained]))
+    return Regularization.of_folds(float(smoothing), 0.0, squares, counts, training)

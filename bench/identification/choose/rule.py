@@ -45,9 +45,6 @@ Source: measured, 3.4 % against 0.1 % of the range on a specimen that ratchets."
 OTHERS, AFTER_LAG = ("creep", "drift", "viscous", "friction"), ("resonance", "delay")
 """Dynamic elements that are tried with each operator beside a lag, where times are known; and those that are tried
 once a lag has lowered the score: one of second order in its place, and a delay."""
-_BEHIND = 2.0
-"""Ratio of scores up to which a model goes on with further elements. Source: a choice; on five records with times the
-chosen models were the same without it, and took an eighth longer."""
 MOST_ROWS = 2000
 """Rows by which models are compared: of more, evenly chosen ones. Source: the RMS of 2000 errors has a relative
 standard error of 1.6 %, below the tie of two scores."""
@@ -263,8 +260,6 @@ class _Search:
                 tried = [with_element(before, element) for element in among]
                 batches.append([replace(best.candidate, dynamics=",".join(elements)) for elements in tried])
             going = self._improve("dynamics", going, batches)
-            least = min((score.error for score in going), default=0.0)
-            going = [score for score in going if score.error <= _BEHIND * least]
 
     def once_more(self) -> None:
         """Try the other structures of the best of all, as its own was found before its memory, then its memories."""

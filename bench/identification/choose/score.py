@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.base import Floats, say_share
+from bench.base import BenchError, Floats, say_share
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem, Initial, set_up_problem
 from bench.identification.choose.splits import (
@@ -42,6 +42,10 @@ _SKIPPED = 0.5
 # Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
 _SHAPE = 1e-3
 
+
+FAILURES = (BenchError, ValueError, ArithmeticError)
+"""Errors by which a fit says that it is not possible; `numpy.linalg.LinAlgError` is a ValueError. Any other is a
+mistake in the program."""
 
 SCORING = "scoring"
 """Stage of which `evaluate` says the share that is done."""
@@ -279,10 +283,8 @@ def evaluate(measured: Measurements, candidates: Sequence[Candidate], *, reshape
                     )
                 say = partial(_say, place, len(candidates))
                 score = _score(measured, candidate, problems[key], say)
-        # A model of another package must not end the comparison of the others.
-        except Exception as error:
-            text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            score = Score(candidate, failure=text)
+        except FAILURES as error:
+            score = Score(candidate, failure=str(error))
         scores.append(replace(score, seconds=time.process_time() - begin))
     return scores
 

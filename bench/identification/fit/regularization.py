@@ -10,6 +10,7 @@ independent, would hardly smooth at all.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,24 +48,51 @@ class Regularization:
     ----------
     smoothing, ridge : float
         Weights of the roughness and of the size of the density; see `fit`.
-    rms : float or None
-        RMS error over blocks left out of the fit, output units; None if both weights were given.
-    spread : float or None
+    rms : float
+        RMS error over blocks left out of the fit, output units; nan if both weights were given.
+    spread : float
         Standard error of `rms` from the scatter of the folds.
-    training_rms : float or None
+    training_rms : float
         RMS error over the samples fitted, mean over the folds.
+    levels : int or None
+        Number of intervals of the plane; None if it was not varied.
     """
 
     smoothing: float
     ridge: float
-    rms: float | None = None
-    spread: float | None = None
-    training_rms: float | None = None
+    rms: float = math.nan
+    spread: float = math.nan
+    training_rms: float = math.nan
+    levels: int | None = None
+
+    @classmethod
+    def of_folds(
+        cls, smoothing: float, ridge: float, squares: Floats, counts: Floats, training: Floats
+    ) -> Regularization:
+        """Return weights with what their fits without each of K folds say.
+
+        Parameters
+        ----------
+        smoothing, ridge : float
+            The weights.
+        squares, counts : ndarray, shape (K,)
+            Weighted sum of the squared errors over each fold, output units squared, and sum of its weights.
+        training : ndarray, shape (K,)
+            RMS error of each fit over its own samples, output units.
+        """
+        by_fold = np.sqrt(squares / counts)
+        return cls(
+            smoothing,
+            ridge,
+            rms=float(np.sqrt(squares.sum() / counts.sum())),
+            spread=float(np.std(by_fold, ddof=1) / np.sqrt(by_fold.size)),
+            training_rms=float(training.mean()),
+        )
 
     def summary(self, unit: str = "") -> str:
         """Return the weights, and the error by which they were chosen, in a line; `unit` starts with a blank."""
         text = f"smoothing {self.smoothing:.2g}, ridge {self.ridge:.2g}"
-        if self.rms is None:
+        if math.isnan(self.rms):
             return text
         return f"{text}; RMS error {self.rms:.4g} ± {self.spread:.2g}{unit} on blocks left out"
 
@@ -130,13 +158,8 @@ def choose_regularization(
             for k, left_out in enumerate(grams):
                 squares[i, k], training[i, k] = _errors(total - left_out, left_out, s * rough + r * plain)
     best = int(np.argmin(squares.sum(axis=1)))
-    by_fold = np.sqrt(squares[best] / counts)
-    return Regularization(
-        *tried[best],
-        rms=float(np.sqrt(squares[best].sum() / counts.sum())),
-        spread=float(np.std(by_fold, ddof=1) / np.sqrt(by_fold.size)),
-        training_rms=float(np.sqrt(training[best] / (counts.sum() - counts)).mean()),
-    )
+    fitted = np.sqrt(training[best] / (counts.sum() - counts))
+    return Regularization.of_folds(*tried[best], squares[best], counts, fitted)
 
 
 def _coarse(regressor: Regressor, layout: CellLayout) -> tuple[Regressor, CellLayout, float, float]:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from bench.base import Floats
 from bench.identification.advice import Advice
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
-from bench.identification.choose.cross_validation import SmoothingTrial, compare_smoothing
+from bench.identification.choose.cross_validation import compare_smoothing
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
 from bench.identification.fit.regularization import Regularization
@@ -131,9 +131,8 @@ def identify_hammerstein(
     with one_thread():
         search, found = choose_elements(search) if chosen is None else reshape(search, find_best(search, chosen, {}))
         if len(tried) > 1:
-            best = _cross_validated(search, found, tried)
-            penalties = Regularization(best.smoothing, 0.0, best.rms, best.spread, best.training_rms)
-            search = replace(search, smoothing=best.smoothing)
+            penalties = _cross_validated(search, found, tried)
+            search = replace(search, smoothing=penalties.smoothing)
             found = find_best(search, found.elements, search.named(found))
     problem = search.static
     parameters = search.parameters(found.elements)
@@ -238,7 +237,7 @@ def set_up_search(
     return problem, Search(times, problem, problem.regressor.dense(), roots, signs, smoothing, ridge)
 
 
-def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> SmoothingTrial:
+def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> Regularization:
     """Return the smoothing of the least error on blocks left out of the fit of the coefficients."""
     responses, sign = search.responses(found.elements, found.values), search.sign(found.fit)
 

@@ -167,6 +167,12 @@ def test_what_fails_is_kept_with_its_reason_and_ends_nothing():
         select(measured, ("polynomial",), Given({"degree": 0}))
 
 
+def test_a_mistake_in_the_program_is_no_failure_of_a_candidate():
+    inputs = ramps([0.0, 1.0, 0.0, 1.0], 0.1)
+    with pytest.raises(TypeError):
+        evaluate(Measurements.of(inputs, inputs), [Candidate("preisach", smoothing="much")])
+
+
 @cases(
     ("inputs", "codes"),
     [
