@@ -7,18 +7,12 @@ import pytest
 from cases import cases
 from emulated_bench import Bench, OnABench, OnALine, OnAServo, OnATorque, over_the_wire, serial_port
 
-from bench.base import DeviceConnectionError, VirtualClock
-from bench.contracts import (
-    ActuatorLineLostContract,
-    LinearStageContract,
-    RestartedActuatorContract,
-    SafeOverAFreshLineContract,
-    SilentInstrumentContract,
-)
+from bench.base import VirtualClock
+from bench.contracts import ActuatorLineLostContract, LinearStageContract, SilentInstrumentContract
 from drivers.dynamixel import DynamixelDrum
 from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.instruments.dynamixel_drum import EmulatedDrum
-from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
+from sim_devices.instruments.dynamixel_table import COUNT
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World
 
@@ -102,52 +96,7 @@ class TestContract(OnAServo, OnADrum, LinearStageContract):
 
 
 class TestSilence(OnADrum, SilentInstrumentContract):
-    def test_a_motion_ends_with_the_error(self, bench):
-        status = bench.device.set(0.1)
-        bench.instrument.unplug()
-        with pytest.raises(DeviceConnectionError, match="stage: "):
-            status.wait()
-
-
-def never_moved(bench):
     pass
-
-
-def moves(bench):
-    bench.device.set(0.1)
-    bench.clock.sleep(1.0)
-
-
-def stands(bench):
-    bench.device.set(0.01).wait()
-
-
-def watchdog_expired(bench):
-    bench.device.set(0.1)
-    bench.clock.sleep(60.0)
-
-
-def error_with_force_on(bench):
-    bench.device.set(0.1)
-    bench.instrument.trip(HardwareError.MOTOR_ENCODER)
-
-
-def error_with_force_off(bench):
-    bench.device.set(0.1)
-    bench.instrument.trip(HardwareError.OVERLOAD)
-
-
-@cases("state", [never_moved, moves, stands, watchdog_expired, error_with_force_on, error_with_force_off])
-def test_safe_from_any_state_and_again_changes_nothing(kind, stack, state):
-    bench = connected(kind, stack)
-    state(bench)
-    bench.device.safe()
-    assert not bench.device.force_enabled
-    where = bench.where()
-    bench.device.safe()
-    bench.clock.sleep(10.0)
-    assert bench.where() == where
-    assert not bench.device.force_enabled
 
 
 # What only a wire can do.
@@ -169,17 +118,7 @@ class OnADrumLine(OnATorque, OnALine, OnADrum):
 
 
 @over_the_wire
-class TestRestart(OnADrumLine, RestartedActuatorContract):
-    pass
-
-
-@over_the_wire
 class TestLineLost(OnADrumLine, ActuatorLineLostContract):
-    pass
-
-
-@over_the_wire
-class TestSafeOverAFreshLine(OnADrumLine, SafeOverAFreshLineContract):
     pass
 
 

@@ -151,22 +151,6 @@ def test_calibration(kind, newtons_per_unit, zero_newtons, stack):
     assert force(bench.device.measure()) == pytest.approx(1.5, abs=3e-3)
 
 
-def test_tare_makes_the_present_force_zero(bench):
-    bench.put(10.0)
-    bench.device.tare()
-    assert force(bench.device.measure()) == pytest.approx(0.0, abs=2e-3)
-    bench.put(12.5)
-    assert force(bench.device.measure()) == pytest.approx(2.5, abs=3e-3)
-    assert force(bench.device.glance()) == pytest.approx(2.5, abs=3e-3)
-    bench.put(4.0)
-    bench.device.tare()
-    assert force(bench.device.measure()) == pytest.approx(0.0, abs=2e-3)
-    bench.device.clear_tare()
-    assert force(bench.device.measure()) == pytest.approx(4.0, abs=1.5e-3)
-    bench.device.clear_tare()
-    assert force(bench.device.measure()) == pytest.approx(4.0, abs=1.5e-3)
-
-
 def test_tare_waits_until_the_signal_is_still(bench):
     bench.device.measure()
     bench.plant.value = 10.0

@@ -224,15 +224,6 @@ def test_silence_of_the_host_stops_the_shaft_at_that_instant(bench):
     bench.device.set(5.0).wait()
 
 
-def test_ticks_of_two_seconds_keep_it_going(bench):
-    bench.device.set(9.0)
-    for _ in range(100):
-        bench.clock.sleep(2.0)
-        bench.device.glance()
-    assert bench.device.torque_enabled
-    assert bench.instrument.read_item(98) == 125
-
-
 def test_load_is_seen_and_holds_the_shaft_off_its_goal(loaded):
     device = loaded.device
     loaded.plant.weight = 0.1

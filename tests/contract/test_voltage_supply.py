@@ -574,39 +574,6 @@ def test_power_that_was_dropped_never_comes_back(calls):
 
 
 @over_the_wire
-def test_other_channel_that_someone_drove_is_not_resumed(bench):
-    bench.instrument.write_object(0x2000, 700, 2)
-    bench.device.set(6.0)
-    assert bench.instrument.read_object(0x2101, 2) == 700
-    bench.clock.sleep(2.0)
-    commands = [request[13:] for request in bench.requests if request.startswith(b"t601823002002")]
-    assert commands == [b"00000000\r"]
-    bench.device.set(3.0)
-    assert bench.instrument.read_object(0x2101, 2) == 0
-
-
-@over_the_wire
-def test_output_is_zero_after_connecting_to_a_device_that_drives(bench):
-    bench.device.set(6.0)
-    bench.device.close()
-    device = bench.connect()
-    assert bench.plant.voltage == 0.0
-    assert math.isnan(device.setpoint)
-    device.close()
-
-
-@over_the_wire
-def test_connecting_after_a_silence_resumes_nothing(bench):
-    bench.device.set(6.0)
-    bench.device.close()
-    bench.clock.sleep(10.0)
-    bench.instrument.world.advance()
-    applied = len(bench.plant.applied)
-    bench.connect().close()
-    assert len(bench.plant.applied) == applied
-
-
-@over_the_wire
 def test_closing_while_the_output_is_on_leaves_it_to_the_watchdog(bench):
     bench.device.set(6.0)
     bench.device.close()

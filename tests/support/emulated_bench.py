@@ -159,9 +159,3 @@ class Spoilt(OnABench):
     @pytest.fixture(params=[damaged, lost])
     def spoil(self, bench, request):
         return lambda: spoil_next_answer(bench.server, request.param)
-
-
-def check_reproducible(record):
-    """Check that `record(seed)` is the same for one seed and another for another."""
-    assert record(7) == record(7)
-    assert record(7) != record(8)

@@ -646,13 +646,6 @@ def test_safe_over_another_line_needs_no_emergency_stop(script, supply):
     assert script.orders()[-1] == (0x200E, 0, 1)
 
 
-def test_safe_of_a_silent_device_tries_everything(script, supply):
-    script.silent = True
-    with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
-        supply.safe()
-    assert {data[1:3].hex() for _, data in script.received} == {"0020", "0e20", "0c20", "0221"}
-
-
 def test_safe_with_a_stale_heartbeat_or_a_fault_needs_no_emergency_stop(script, connect, clock):
     supply = connect(heartbeat=0.5)
     supply.set(6.0)
@@ -1141,34 +1134,11 @@ def test_command_of_another_host_has_to_come_twice(controller, synchronous):
         synchronous.measure()
 
 
-def test_restart_is_known_by_the_mark(controller, synchronous):
-    synchronous.set(6.0)
-    controller.mapped.clear()
-    controller.objects |= {(0x2106, 16): (0, 4), (0x2102, 1): (0, 2)}
-    with pytest.raises(DeviceRestartedError):
-        synchronous.measure()
-    for action in (synchronous.measure, lambda: synchronous.set(3.0)):
-        with pytest.raises(DeviceRestartedError):
-            action()
-    assert synchronous.setpoint == 0.0
-
-
 def test_restart_that_is_announced_ends_the_reading(controller, synchronous):
     controller.spoilt = [lambda _sent: [line(0x701, b"\x00")]]
     with pytest.raises(DeviceRestartedError):
         synchronous.measure()
     assert controller.synchronized == 1
-
-
-def test_restart_is_found_by_another_line(controller, synchronous, clock):
-    synchronous.set(6.0)
-    controller.beat_at = clock.now()
-    before = synchronous._line
-    synchronous.reconnect()
-    assert synchronous._line is not before
-    controller.objects[0x2106, 16] = (0, 4)
-    with pytest.raises(DeviceRestartedError):
-        synchronous.reconnect()
 
 
 def test_mark_that_the_controller_does_not_report_is_none(controller, synchronous):

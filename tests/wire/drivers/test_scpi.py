@@ -580,12 +580,6 @@ def test_a_serial_port_is_set_up_as_the_rig_file_says(stack, changes, options):
     assert {key: getattr(port, key) for key in options} == options
 
 
-def test_a_visa_address_needs_the_library(monkeypatch):
-    monkeypatch.setattr("drivers.scpi.transport.importlib.util.find_spec", lambda _: None)
-    with pytest.raises(ValueError, match=r"pip install '.+\[visa\]'"):
-        SCPIActuator.Settings(port="visa://ASRL1::INSTR", **SUPPLY)
-
-
 def test_the_safe_state_is_asked_for_once_a_line(lab):
     device = lab.connect()
     device.set(5.0)

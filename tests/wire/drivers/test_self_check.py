@@ -43,12 +43,6 @@ def test_a_healthy_rig_and_nothing_moves(opened, name):
     assert [after[key].value for key in outputs] == [before[key].value for key in outputs]
 
 
-def test_a_limit_that_another_program_changed(opened):
-    rig = opened("vo2")
-    connect_again(rig, "tec", current_limit=1.0)
-    assert advised(rig.devices["tec"]) == {"current_limit": "1 A in the device"}
-
-
 def test_a_watchdog_that_another_program_switched_off(opened):
     rig = opened("sma")
     connect_again(rig, "fan").close()
@@ -61,21 +55,3 @@ def test_a_watchdog_of_another_time(opened):
     fan._output.unguard()
     connect_again(rig, "fan", watchdog=60)
     assert advised(fan) == {"watchdog read back": "DIO0: 60 s"}
-
-
-def test_a_battery_that_is_too_low(opened):
-    rig = opened("sma")
-    rig.laboratory.inject("low-battery", {"volts": 3.0})
-    assert advised(rig.devices["supply"]) == {"power supply": "3.0 V"}
-
-
-def test_a_converter_that_stands_still(opened):
-    rig = opened("sma")
-    rig.laboratory.inject("load_cell.freeze")
-    assert list(advised(rig.devices["load_cell"])) == ["converter"]
-
-
-def test_a_filter_that_another_program_changed(opened):
-    rig = opened("sma")
-    connect_again(rig, "load_cell", filter=6)
-    assert advised(rig.devices["load_cell"]) == {"filter": "6 in the instrument"}

@@ -298,20 +298,13 @@ def vector_cell() -> Cell:
     return cell
 
 
-def test_byte_vectors():
-    assert ModbusRtuServer(vector_cell()).receive(READ) == READ_REPLY
-    cell = Cell()
-    cell.rest(4.0)
-    server = ModbusRtuServer(cell)
-    assert server.receive(TARE) == TARE
-    assert cell.floats(0x2000, 2) == [4.0, 0.0]
-
-
 EXCHANGES = [
     (READ, READ_REPLY),
     (sealed("01 04 35 00 00 05"), sealed("01 04 0A 41 40 00 00 41 38 00 00 00 30")),
     (sealed("01 06 20 61 00 04"), sealed("01 06 20 61 00 04")),  # reset tare
     (sealed("01 03 20 60 00 01"), sealed("01 03 02 00 10")),
+    (TARE, TARE),
+    (sealed("01 03 20 60 00 01"), sealed("01 03 02 00 30")),
     (sealed("01 10 21 06 00 02 04 00 00 00 05"), sealed("01 10 21 06 00 02")),  # filter 5
     (sealed("01 03 21 06 00 02"), sealed("01 03 04 00 00 00 05")),
     (sealed("01 06 20 61 00 08"), sealed("01 86 04")),  # not still, as the filter has just begun anew
@@ -381,15 +374,3 @@ def test_any_garbage_is_passed_over(garbage, pieces):
     server.receive(garbage[position:])
     assert server.receive(READ)[-15:-12] == READ_REPLY[:3]
     assert len(server._received) < LONGEST_FRAME
-
-
-def test_a_defect_of_the_instrument_is_a_device_failure(caplog):
-    cell = Cell()
-
-    def broken() -> float:
-        raise ZeroDivisionError
-
-    cell._force = broken
-    cell.clock.sleep(1.0)
-    assert ModbusRtuServer(cell).receive(READ) == sealed("01 83 04")
-    assert "the emulated instrument failed" in caplog.text

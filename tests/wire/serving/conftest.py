@@ -3,35 +3,16 @@
 import json
 import subprocess
 import sys
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import serial
 
 from bench.base import Stopwatch
-from sim_devices.serving.process import serve
 
 LONG = 60.0
 """Wall-clock time (s) that a busy machine may take for an answer."""
-
-
-@pytest.fixture(scope="package")
-def sma(warmly):
-    """The laboratory of the SMA wire, served for all tests of the package."""
-    with ExitStack() as stack:
-        with warmly():
-            rig = stack.enter_context(serve("sma", clock="x1"))
-        yield rig
-
-
-@pytest.fixture(scope="package")
-def vo2(warmly):
-    """The VO2 laboratory, served for all tests of the package."""
-    with ExitStack() as stack:
-        with warmly():
-            rig = stack.enter_context(serve("vo2", clock="x1"))
-        yield rig
 
 
 @pytest.fixture

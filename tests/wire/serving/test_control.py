@@ -159,6 +159,7 @@ def test_a_restarted_supply_says_so(sma, opened):
     [
         (b"garbage", "not a line of JSON"),
         (b"\xff\xfe", "not a line of JSON"),
+        (b'{"do":' * 100_000, "not a line of JSON"),
         (b"[1]", "expected an object"),
         (b'{"do": 3}', "expected an object"),
         (b'{"do": "explode"}', "there is no request 'explode'; there are: help, state,"),
