@@ -57,9 +57,7 @@ def call_process(*words: object) -> Ended:
     command = [sys.executable, "-P", "-m", "bench", *map(str, words)]
     path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path.strip(os.pathsep)}
-    ended = subprocess.run(
-        command, capture_output=True, timeout=60, check=False, env=environment, stdin=subprocess.DEVNULL
-    )
+    ended = subprocess.run(command, capture_output=True, check=False, env=environment, stdin=subprocess.DEVNULL)
     return checked(
         Ended(ended.returncode, ended.stdout.decode("utf-8", "replace"), ended.stderr.decode("utf-8", "replace"))
     )
