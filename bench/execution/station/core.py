@@ -8,26 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from enum import Enum
 
 from bench.base import BenchError, GuardianError, InterlockError
 from bench.rig import InterlockFinding, InterlockWatch, Level
 
 _FIRST_PROMISE = 10.0
 """What counts before the bench has promised anything, s."""
-
-
-class State(Enum):
-    """How far a station is."""
-
-    IDLE = "idle"
-    """Nothing has been sent to a device yet."""
-    ARMED = "armed"
-    """An output may be on."""
-    TRIPPED = "tripped"
-    """In the safe state, for good: what the bench still asks for is refused."""
-    ENDED = "ended"
-    """In the safe state, as the bench asked for it."""
 
 
 class StationCore:
@@ -42,12 +28,10 @@ class StationCore:
 
     Attributes
     ----------
-    state : State
-        How far it is.
     over : bool
         Whether it is in its safe state for good.
     cause : BenchError or None
-        What tripped it.
+        What tripped it; None if it has not tripped, or the bench asked for the end.
     late : bool
         Whether that was a promise of the bench.
     holding : bool
@@ -66,7 +50,6 @@ class StationCore:
         self._asked = False
         self._is_bound = False
         self._seen: float | None = None
-        self.state = State.IDLE
         self.over = False
         self.cause: BenchError | None = None
         self.late = False
@@ -91,8 +74,8 @@ class StationCore:
 
     def arm(self) -> None:
         """Note that an output may be on from now on."""
-        if self.state is State.IDLE:
-            self.state, self._is_bound = State.ARMED, True
+        if not self.over:
+            self._is_bound = True
 
     def request(self, now: float) -> None:
         """Begin with a request of the bench.
@@ -206,11 +189,10 @@ class StationCore:
     def trip(self, cause: BenchError) -> None:
         """End the run in the safe state; the first cause counts."""
         if not self.over:
-            self.state, self.over, self.cause = State.TRIPPED, True, cause
+            self.over, self.cause = True, cause
 
     def end(self) -> None:
         """End the run in the safe state, as the bench asks for it."""
-        if not self.over:
-            self.state, self.over = State.ENDED, True
+        self.over = True
         # It need not come back.
         self._is_bound = False
