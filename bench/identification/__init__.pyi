@@ -10,6 +10,9 @@ from .bands import (
     calibrate_band_in_time as calibrate_band_in_time,
     input_half_widths as input_half_widths,
 )
+from .branches import (
+    turning_points as turning_points,
+)
 from .by_name import (
     Identification as Identification,
     Initial as Initial,

@@ -14,8 +14,9 @@ import numpy as np
 from bench.base import BenchError, ConfigurationError
 from bench.control import Playback
 from bench.devices import Dwell, Settle
-from bench.execution.resumption.corners import corners, turning_points
+from bench.execution.resumption.corners import corners
 from bench.execution.run_at_hand import NOT_AT_WORK
+from bench.identification import turning_points
 from bench.protocol import (
     PROMPT,
     Control,
@@ -397,7 +398,7 @@ class _Feeding:
         path = ticks[message.drive if units.get(message.drive) == units.get(setpoint) else setpoint]
         low, high = message.limits or (-math.inf, math.inf)
         finite = path[np.isfinite(path)].tolist()
-        for i in turning_points(finite, _LEAST_TURN * self._span(message.actuator, finite)):
+        for i in self._turns(message.actuator, finite):
             self._add({message.actuator: min(max(finite[i], low), high)}, None)
         self._add(record.setpoints, None)
 
@@ -428,15 +429,18 @@ class _Feeding:
         turns: set[int] = set()
         for name, path in paths.items():
             if all(map(math.isfinite, path)):
-                turns |= set(turning_points(path, _LEAST_TURN * self._span(name, path)))
+                turns.update(self._turns(name, path))
         for i in sorted(turns):
             self._add({name: path[i] for name, path in paths.items() if math.isfinite(path[i])}, None)
         self._add(record.setpoints, None)
 
-    def _span(self, actuator: str, path: Sequence[float]) -> float:
+    def _turns(self, actuator: str, path: Sequence[float]) -> list[int]:
+        """Return where a controller turned; of its many turns, as readings have noise, a specimen remembers these."""
+        if not path:
+            return []
         been = [place.setpoints[actuator] for place in self._fed.places if actuator in place.setpoints]
-        whole = [*been, *path]
-        return max(whole) - min(whole) if whole else 0.0
+        turns: list[int] = turning_points(path, _LEAST_TURN * float(np.ptp([*been, *path]))).tolist()
+        return turns
 
     def _add(self, setpoints: Mapping[str, float], settle: Settle | None, prompt: Prompt | None = None) -> None:
         """Note where the actuators are now; a further wait in the same place makes it longer."""
