@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from bench.execution.guardian.remote import GuardedRig, RemoteStation
+from bench.execution.guardian.remote import RemoteStation
 from bench.rig import attach, load_rig
 from sim_devices.serving.process import EmulatedRig
 
@@ -35,8 +35,8 @@ def connected(rig: EmulatedRig, file: str | None = None, **overrides: str) -> It
     with ExitStack() as stack:
         attachment = attach(rig.endpoints_file, rig.name)
         stack.callback(attachment.close)
-        guarded = GuardedRig(load_rig(name, values), name, values, rig.endpoints_file, 0, "a test")
-        station = RemoteStation(guarded, attachment.clock)
+        file = load_rig(name, values)
+        station = RemoteStation(attachment.clock, file, name, values, rig.endpoints_file, 0, "a test")
         # While it can be found: nobody knows the rescuer of a guardian that has died.
         stack.callback(_leave, station, rescuer_of(station._process.pid))
         yield station

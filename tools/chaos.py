@@ -137,8 +137,7 @@ def trial(title: str, endpoints: Path, control: ControlClient) -> dict:
 
     remote.start_guardian = lambda log: _start(*METHODS[title], note, log)
     attachment = attach(endpoints, "vo2")
-    guarded = remote.GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
-    station = remote.RemoteStation(guarded, attachment.clock)
+    station = remote.RemoteStation(attachment.clock, load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
     rescuer = rescuer_of(station._process.pid)
     station._answer_within = 2.0
     found: dict = {"method": title, "error": None}

@@ -11,12 +11,11 @@ import sys
 import time
 from pathlib import Path
 
-from bench.execution.guardian.remote import GuardedRig, RemoteStation
+from bench.execution.guardian.remote import RemoteStation
 from bench.rig import attach, load_rig
 
 endpoints = Path(sys.argv[1])
-guarded = GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
-station = RemoteStation(guarded, attach(endpoints, "vo2").clock)
+station = RemoteStation(attach(endpoints, "vo2").clock, load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
 station.promise(600.0, "a child lives on")
 station.apply({"tec": 40.0})
 if sys.argv[2:]:

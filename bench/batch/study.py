@@ -413,19 +413,16 @@ def reproduce(
     except MissingExtraError as error:
         print_plain(console, f"no recordings: {error}")
         recorded = False
-    from bench.base import Workers
+    # Here, as numba is slow to load.
+    from bench.base import CompilationDisplay, Workers
 
     stopwatch = Stopwatch()
     folder = out / f"reproduce-{name}-seed-{seed}"
-    with Workers(1 if live else workers, console, name, study.all_kernels) as pool:
-        # Not before: a worker process loads its modules meanwhile.
-        from bench.base import CompilationDisplay
-
-        with CompilationDisplay(console):
-            on = rig or study.rig or ""
-            campaign = RunSeries(on, folder, seed, live, pool, figure_format, recorded, settings)
-            found = study.carry_out(campaign)
-            recordings = campaign.recordings()
+    with Workers(1 if live else workers, console, name, study.all_kernels) as pool, CompilationDisplay(console):
+        on = rig or study.rig or ""
+        campaign = RunSeries(on, folder, seed, live, pool, figure_format, recorded, settings)
+        found = study.carry_out(campaign)
+        recordings = campaign.recordings()
     carried_out = {RunFolder(run.folder).meta["protocol"] for run in campaign.runs if settings}
     for protocol in settings.keys() - carried_out:
         print_plain(console, f"note: parameters of {protocol} are set, but the study has no run of it")

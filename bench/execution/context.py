@@ -33,7 +33,7 @@ from bench.execution.accuracy import check_accuracy
 from bench.execution.detached_observer import DetachedObserver
 from bench.execution.dialogue import Dialogue
 from bench.execution.engine import Engine, Outcome, check_before_moving
-from bench.execution.guardian.remote import STACKS_NAME, GuardedRig, RemoteStation
+from bench.execution.guardian.remote import STACKS_NAME, RemoteStation
 from bench.execution.notify import Notifier, facts_of
 from bench.execution.rehearsal import Rehearsal, rehearse
 from bench.execution.resumption.interrupted import Interrupted
@@ -509,8 +509,7 @@ def _connected(
     if continue_time is not None:
         continue_time()
     doing = f"a run of {run.protocol.name}, recorded below {run.folder.resolve()}"
-    guarded = GuardedRig(file, run.rig, run.overrides, run.attach, run.seed, doing)
-    return RemoteStation(guarded, clock), attachment
+    return RemoteStation(clock, file, run.rig, run.overrides, run.attach, run.seed, doing), attachment
 
 
 def _clock(run: Run, file: RigFile, stack: ExitStack) -> tuple[Clock, Attachment | None]:

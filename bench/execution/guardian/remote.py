@@ -9,7 +9,6 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TextIO
@@ -48,34 +47,6 @@ _SLICE = 0.2
 STACKS_NAME = "stacks.txt"
 
 
-@dataclass(frozen=True)
-class GuardedRig:
-    """What a guardian is to open.
-
-    Attributes
-    ----------
-    file : RigFile
-        The rig, as this process has read it.
-    rig : str
-        Name of a packaged rig, or path of a rig file.
-    overrides : mapping of str to str
-        Values of the rig file to replace, by dotted key.
-    attach : Path or None
-        Endpoints file of `bench rig emulate`, where the instruments are served.
-    seed : int
-        Seed of everything random in an emulated laboratory.
-    doing : str
-        What it is opened for, in a few words, for who finds the rig in use.
-    """
-
-    file: RigFile
-    rig: str
-    overrides: Mapping[str, str]
-    attach: Path | None
-    seed: int
-    doing: str
-
-
 class RemoteStation(Station):
     """A station in another process.
 
@@ -84,10 +55,18 @@ class RemoteStation(Station):
 
     Parameters
     ----------
-    guarded : GuardedRig
-        What to open.
     clock : Clock
         The clock of the run.
+    file : RigFile
+        The rig, as this process has read it.
+    rig, overrides
+        Name or path of the rig file that the guardian is to open, and values of it to replace, by dotted key.
+    attach : Path or None
+        Endpoints file of `bench rig emulate`, where the instruments are served.
+    seed : int
+        Seed of everything random in an emulated laboratory.
+    doing : str
+        What it is opened for, in a few words, for who finds the rig in use.
 
     Raises
     ------
@@ -99,9 +78,18 @@ class RemoteStation(Station):
         If the guardian does not start.
     """
 
-    def __init__(self, guarded: GuardedRig, clock: Clock) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        file: RigFile,
+        rig: str,
+        overrides: Mapping[str, str],
+        attach: Path | None,
+        seed: int,
+        doing: str,
+    ) -> None:
         self.clock = clock
-        self._answer_within = LONGEST_ANSWER + guarded.file.safety.reconnect
+        self._answer_within = LONGEST_ANSWER + file.safety.reconnect
         self._number = 0
         self._news: list[News] = []
         self._tripped: BenchError | None = None
@@ -119,9 +107,9 @@ class RemoteStation(Station):
         self._scratch = tempfile.TemporaryDirectory(prefix="bench-rescuer-", ignore_cleanup_errors=True)
         self._report = Report(Path(self._scratch.name) / "report.json")
         self._what = {
-            "rig": guarded.rig,
-            "overrides": dict(guarded.overrides),
-            "attach": None if guarded.attach is None else str(guarded.attach),
+            "rig": rig,
+            "overrides": dict(overrides),
+            "attach": None if attach is None else str(attach),
             "report": str(self._report.path),
             "process": os.getpid(),
         }
@@ -132,16 +120,16 @@ class RemoteStation(Station):
                 "hello",
                 _OPENING,
                 **self._what,
-                content=repr(guarded.file.content),
-                seed=guarded.seed,
-                doing=guarded.doing,
+                content=repr(file.content),
+                seed=seed,
+                doing=doing,
             )
         except BaseException as error:
             self.close()
             if isinstance(error, GuardianError) and (said := self._last_words):
                 raise GuardianError(f"{error}; it said: {said}") from None
             raise
-        self.description = _description(guarded.file, found)
+        self.description = _description(file, found)
         self._setpoints = dict.fromkeys(self.description.limits, math.nan)
 
     @property

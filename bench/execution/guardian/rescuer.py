@@ -62,9 +62,9 @@ class Rescuer:
     Parameters
     ----------
     content : mapping
-        `rig`, `overrides` and `attach` as for `GuardedRig`, and `report`, the path of the file in which it says that
-        it is ready, and later what has become of each device; `process`, the number of the bench; `guardian` if that
-        is not this process, 0 for none.
+        `rig`, `overrides` and `attach` as for `RemoteStation`, and `report`, the path of the file in which it says
+        that it is ready, and later what has become of each device; `process`, the number of the bench; `guardian` if
+        that is not this process, 0 for none.
     """
 
     def __init__(self, content: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bench.base import Clock, ConfigurationError, wall_time
 from bench.execution.resumption.feeding import Past, feed
@@ -14,6 +14,9 @@ from bench.execution.resumption.repriming import RESUMED, Resumption
 from bench.protocol import LATENESS, TRACES, ProtocolDefinition, ProtocolParameters
 from bench.record import Event, Journal
 from bench.rig import SETPOINT, RigDescription, Slots
+
+if TYPE_CHECKING:
+    from bench.execution.resumption.resuming import Resume
 
 _DESCRIBED = ("operator", "command", "packages", "git", "host", "devices", "rig_content", "protocol_source")
 """What is kept of each process that takes a run up."""
@@ -36,19 +39,15 @@ class Interrupted:
         What it has recorded.
     written : datetime
         Time of day of its last row.
-    sigmas : float
-        See `Resumption`.
-    accept_changes, accept_disagreement : bool
-        Whether to go on although something has changed, or the specimen is not as it was.
+    asked : Resume
+        How it is to be taken up.
     """
 
     folder: Path
     meta: Mapping[str, Any]
     past: Past
     written: datetime
-    sigmas: float
-    accept_changes: bool
-    accept_disagreement: bool
+    asked: Resume
 
     @property
     def _resumes(self) -> list[dict[str, Any]]:
@@ -104,7 +103,7 @@ class Interrupted:
         compared = tuple(name for name in dict.fromkeys(measured) if name in self.past.names and name not in traced)
         zero = 0.0 if self.meta["laboratory_epoch"] is None else (self._epoch - clock.epoch).total_seconds()
         drive = slots["drive"].signal if "drive" in slots else ""
-        return Resumption(fed, compared, drive, self.sigmas, not self.accept_disagreement, by_hand, zero)
+        return Resumption(fed, compared, drive, self.asked.sigmas, not self.asked.accept_disagreement, by_hand, zero)
 
     @property
     def latest(self) -> dict[str, Any]:
@@ -142,7 +141,7 @@ class Interrupted:
         ConfigurationError
             If something has changed and that is not accepted.
         """
-        if changes and not self.accept_changes:
+        if changes and not self.asked.accept_changes:
             more = f", and {len(changes) - _MOST_NAMED} more" if len(changes) > _MOST_NAMED else ""
             raise ConfigurationError(
                 f"the run was started otherwise: {'; '.join(changes[:_MOST_NAMED])}{more}. Restore that, or go on "

@@ -90,15 +90,7 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
         take_in(asked.folder)
         with Record(asked.folder) as record:
             meta, past, files = record.meta, Past.of(record), record.files()
-        again = Interrupted(
-            folder=folder,
-            meta=meta,
-            past=past,
-            written=datetime.fromtimestamp(written, UTC),
-            sigmas=asked.sigmas,
-            accept_changes=asked.accept_changes,
-            accept_disagreement=asked.accept_disagreement,
-        )
+        again = Interrupted(folder, meta, past, datetime.fromtimestamp(written, UTC), asked)
         # On Windows, what is still open cannot be deleted.
         scratch = tempfile.TemporaryDirectory(prefix="bench-resume-", ignore_cleanup_errors=True)
         run = _run_of(asked, meta, files, Path(stack.enter_context(scratch)).resolve())

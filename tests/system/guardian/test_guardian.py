@@ -22,7 +22,7 @@ from bench.base import (
     LimitError,
     VirtualClock,
 )
-from bench.execution.guardian.remote import GuardedRig, RemoteStation
+from bench.execution.guardian.remote import RemoteStation
 from bench.rig import Look, Rig, load_rig
 
 pytestmark = [
@@ -121,10 +121,10 @@ class TestRequests:
     def test_a_rig_file_that_was_edited_since_the_bench_read_it_is_refused(self, vo2, tmp_path):
         path = tmp_path / "vo2.toml"
         path.write_text('extends = "vo2"\n')
-        guarded = GuardedRig(load_rig(str(path)), str(path), {}, vo2.endpoints_file, 0, "a test")
+        file = load_rig(str(path))
         path.write_text('extends = "vo2"\n[safety]\nrate = 4.0\n')
         with pytest.raises(ConfigurationError, match="was changed while the run was prepared"):
-            RemoteStation(guarded, VirtualClock())
+            RemoteStation(VirtualClock(), file, str(path), {}, vo2.endpoints_file, 0, "a test")
 
 
 class TestBenchGone:
