@@ -31,8 +31,9 @@ from bench.base import (
 from bench.control import Command, DriftEstimator, LimitCycleWatch, agility_for
 from bench.devices import Arrived, Dwell, Settle, Settled, UntilSteady
 from bench.execution import fixed_rate, manual as by_hand
+from bench.execution.notify import Notifier
 from bench.execution.resumption.repriming import Resumption, reprime
-from bench.execution.run_at_hand import NOT_AT_WORK, Notices, Observer, RunAtHand, RunRecord, traced
+from bench.execution.run_at_hand import NOT_AT_WORK, Observer, RunAtHand, RunRecord, traced
 from bench.execution.station.interface import Station
 from bench.operator import AT_A_PROMPT, NOBODY, RESUME, Question
 from bench.protocol import (
@@ -121,7 +122,7 @@ class Engine:
         interrupts: Interrupts,
         ask: Callable[[Question], str] | None = None,
         zero: float | None = None,
-        messages: Notices | None = None,
+        messages: Notifier | None = None,
         changes: Iterable[ParameterChange] = (),
     ) -> None:
         self._station = station

@@ -11,9 +11,10 @@ from typing import Any, Protocol
 from bench.base import AbortError, ConfigurationError, Interrupts, closest, format_duration
 from bench.control import Trace
 from bench.devices import Settled, Signal
+from bench.execution.notify import Notifier
 from bench.execution.station.interface import Station
 from bench.operator import ABORT, AT_A_PAUSE, NOBODY, NOTE, OFF, RESUME, SET, STEP, Question
-from bench.protocol import LATENESS, PARAMETER, TRACES, ParameterChange, Reading
+from bench.protocol import LATENESS, PARAMETER, TRACES, OpenParameters, Reading
 from bench.record import Event, Lateness, StepRecord
 from bench.rig import Look
 
@@ -72,26 +73,6 @@ class Observer(Protocol):
         """See something that happened."""
 
 
-class Notices(Protocol):
-    """Sends messages to people; what fails belongs into the record."""
-
-    def take_notices(self) -> list[str]:
-        """Return what has failed since the last call."""
-
-    def finish(self) -> None:
-        """Wait a moment for what is still to be sent."""
-
-
-class ParametersAtHand(Protocol):
-    """The parameters of a protocol that goes on."""
-
-    def changeable(self) -> Mapping[str, str]:
-        """Return those that may be changed, with value, unit and what is allowed."""
-
-    def change(self, step: int, name: str, value: str) -> ParameterChange:
-        """Change one from the reading of a step on; raises ConfigurationError if that is not allowed."""
-
-
 class RunAtHand:
     """What all parts of a run share: its station and clock, its record, its observers, and the operator.
 
@@ -112,7 +93,7 @@ class RunAtHand:
         a prompt aborts the run.
     zero : float, optional
         Time of the clock at which the record begins to count, s; now if not given.
-    messages : Notices, optional
+    messages : Notifier, optional
         What sends messages about the run.
 
     Attributes
@@ -129,7 +110,7 @@ class RunAtHand:
         Time of the clock at which the record begins to count, s.
     lateness : dict of str to Lateness
         How late the samples of loops were, by label.
-    parameters : ParametersAtHand or None
+    parameters : OpenParameters or None
         The parameters of the protocol, for changes at a pause.
     """
 
@@ -141,7 +122,7 @@ class RunAtHand:
         interrupts: Interrupts,
         ask: Callable[[Question], str] | None,
         zero: float | None = None,
-        messages: Notices | None = None,
+        messages: Notifier | None = None,
     ) -> None:
         self.station = station
         self.clock = station.clock
@@ -158,7 +139,7 @@ class RunAtHand:
         self._interrupts = interrupts
         self._messages = messages
         self.lateness: dict[str, Lateness] = {}
-        self.parameters: ParametersAtHand | None = None
+        self.parameters: OpenParameters | None = None
         self._pause_reason = ""
         self._is_demanded = False
         self._one_step = False

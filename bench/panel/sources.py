@@ -257,9 +257,6 @@ class RunInProgress:
         """Close the panel; the run goes on."""
         return True
 
-    def wait(self) -> None:
-        """Wait for nothing."""
-
     def _shown_of(self, meta: Mapping[str, Any]) -> Shown:
         """Return the rig of the run, as far as it can be read here."""
         limits: dict[str, Any] = {}

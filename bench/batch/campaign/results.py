@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -139,14 +139,7 @@ def over_seeds(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
         for key in list(table.columns)[names.index("reason") + 1 :]
         if key[0] not in (*_NOT_GROUPED, "folder") and _is_numeric(table.columns[key])
     ]
-    rows: list[Row] = []
-    for group, members in _groups(table, [("table", ""), *keys]):
-        completed = sum(table.columns[("status", "")][i] == "completed" for i in members)
-        row = group | _without_units(runs=len(members), completed=completed)
-        for name, unit in results:
-            row |= _statistics(name, unit, (table.columns[(name, unit)][i] for i in members))
-        rows.append(row)
-    return ResultsTable.of(rows)
+    return _over(table, [("table", ""), *keys], results, "runs")
 
 
 def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
@@ -166,14 +159,8 @@ def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> Results
 
 def over_runs(comparisons: ResultsTable) -> ResultsTable:
     """Return median, worst and spread of the errors of each model over the runs of a `comparisons_table`."""
-    rows: list[Row] = []
-    for group, members in _groups(comparisons, [("comparison", ""), ("model", "")]):
-        row = group | _without_units(runs=len(members))
-        for name, unit in comparisons.columns:
-            if name in ERRORS:
-                row |= _statistics(name, unit, (comparisons.columns[(name, unit)][i] for i in members))
-        rows.append(row)
-    return ResultsTable.of(rows)
+    errors = [key for key in comparisons.columns if key[0] in ERRORS]
+    return _over(comparisons, [("comparison", ""), ("model", "")], errors, "runs")
 
 
 def shown_columns(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
@@ -209,27 +196,9 @@ def studies_of(expansion: Expansion, done: Mapping[str, Done]) -> dict[str, list
     return found
 
 
-def studies_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
-    """Return each number of each study over its seeds: median, worst (of the greatest magnitude), and spread."""
-    found: dict[tuple[str, str, str], list[float]] = {}
-    for task in expansion.tasks.values():
-        if isinstance(task, StudyTask):
-            for name, (value, _) in done[task.name].results.items():
-                found.setdefault((task.study, Path(task.rig).stem, name), []).append(value)
-    return ResultsTable.of(
-        [
-            _without_units(
-                study=study,
-                rig=rig,
-                number=name,
-                seeds=len(values),
-                median=statistics.median(values),
-                worst=max(values, key=abs),
-                spread=max(values) - min(values),
-            )
-            for (study, rig, name), values in found.items()
-        ]
-    )
+def studies_table(values: ResultsTable) -> ResultsTable:
+    """Return each number of each study over its seeds, of the `study_values`: median, worst and spread."""
+    return _over(values, [(name, "") for name in ("study", "rig", "number")], [("value", "")], "seeds", named=False)
 
 
 def study_values(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
@@ -268,15 +237,15 @@ def show_results(expansion: Expansion, done: Mapping[str, Done], folder: Path, c
         compared = over_runs(comparisons)
         compared.print("comparisons, over the runs", console)
         files |= {"comparisons": comparisons, "comparisons-summary": compared}
-    studies = studies_table(expansion, done)
-    if len(studies):
+    values = study_values(expansion, done)
+    if len(values):
         texts = [
             print_over_seeds(name, [folder / task for task in tasks], console)
             for name, tasks in studies_of(expansion, done).items()
         ]
         write_result(folder / MARKDOWN_NAME, "\n\n".join(texts) + "\n")
         print_plain(console, f"every number: {folder / 'studies.csv'}")
-        files |= {"studies": studies, "study-values": study_values(expansion, done)}
+        files |= {"studies": studies_table(values), "study-values": values}
     return write_tables(files, folder, console)
 
 
@@ -301,27 +270,39 @@ def together(tables: Iterable[ResultsTable]) -> ResultsTable:
     return ResultsTable.of(rows)
 
 
-def _groups(table: ResultsTable, keys: Sequence[tuple[str, str]]) -> Iterator[tuple[Row, list[int]]]:
-    """Yield the different cells of some columns, with the rows that have them."""
+def _over(
+    table: ResultsTable,
+    keys: Sequence[tuple[str, str]],
+    results: Sequence[tuple[str, str]],
+    count: str,
+    *,
+    named: bool = True,
+) -> ResultsTable:
+    """Return median, worst (the greatest) and spread of results over the rows that have the same cells elsewhere.
+
+    `keys` are the other columns, and `count` is the head of the number of rows. Heads begin with the name of a result
+    if there are several.
+    """
     groups: dict[tuple[Cell, ...], list[int]] = {}
     for i, cells in enumerate(zip(*(table.columns[key] for key in keys), strict=True)):
         groups.setdefault(cells, []).append(i)
-    for cells, members in groups.items():
-        yield dict(zip(keys, cells, strict=True)), members
+    rows: list[Row] = []
+    for group, members in groups.items():
+        row = dict(zip(keys, group, strict=True)) | _without_units(**{count: len(members)})
+        if count == "runs" and (statuses := table.columns.get(("status", ""))):
+            row |= _without_units(completed=sum(statuses[i] == "completed" for i in members))
+        for name, unit in results:
+            values = _numbers(table.columns[(name, unit)][i] for i in members)
+            prefix = f"{name} " if named else ""
+            row[(f"{prefix}{MEDIAN}", unit)] = statistics.median(values) if values else None
+            row[(f"{prefix}{WORST}", unit)] = max(values, key=abs) if values else None
+            row[(f"{prefix}{SPREAD}", unit)] = max(values) - min(values) if values else None
+        rows.append(row)
+    return ResultsTable.of(rows)
 
 
 def _without_units(**cells: Cell) -> Row:
     return {(name, ""): cell for name, cell in cells.items()}
-
-
-def _statistics(name: str, unit: str, cells: Iterable[Cell]) -> Row:
-    """Return median, worst (the greatest) and spread of cells as columns; None where there is no number."""
-    values = _numbers(cells)
-    return {
-        (f"{name} {MEDIAN}", unit): statistics.median(values) if values else None,
-        (f"{name} {WORST}", unit): max(values) if values else None,
-        (f"{name} {SPREAD}", unit): max(values) - min(values) if values else None,
-    }
 
 
 def _is_numeric(cells: Sequence[Cell]) -> bool:
