@@ -39,8 +39,7 @@ from bench.control import (
     tuned,
     widened,
 )
-from bench.models import IdentifiedDynamics, Reach, ResponseDynamics, TwoStageState, TwoStageStream
-from rigs.muscles.lag import Lag, LagSearch
+from bench.models import IdentifiedDynamics, Reach, ResponseDynamics, SeenInput, TwoStageState, TwoStageStream
 from rigs.muscles.tasks import ForceTask, LengthTask, Task
 from rigs.muscles.two_stage_inverse import TwoStageInverse
 
@@ -59,6 +58,39 @@ _LEAST_PART = 0.25
 """Part of a move to which overshoots reduce it at most."""
 _SHORTEST_PERIOD = 0.2
 """Time between two readings where nothing slower is known, s: what a reading of all signals takes."""
+
+
+@dataclass(frozen=True)
+class LagSearch:
+    """How a time constant is looked for while a muscle is controlled.
+
+    A muscle in a draught, or another of its kind, has another time constant than the one that was identified. Of
+    several, that one is taken with which the model's error changes least from reading to reading: what the wrong
+    lag leaves changes whenever the muscle moves, and the error of the model at rest does not.
+    """
+
+    factor: float = 1.1
+    """Ratio of neighbouring time constants."""
+    steps: int = 8
+    """Number of time constants above, and of those below the identified one; 0 for that alone."""
+    margin: int = 2
+    """How many steps above the likeliest the time constant is by which the muscle is led: the model is flat after a
+    reversal where the muscle is not, which makes it seem faster than it is."""
+    memory: float = 250.0
+    """Number of readings after which a change of the error is forgotten."""
+    advantage: float = 0.8
+    """Part of the squares of its changes below which another time constant takes the place of the present one."""
+
+    def __post_init__(self) -> None:
+        check_positive(self, "memory", "advantage")
+        if not 1.0 < self.factor < math.inf:
+            raise ValueError(f"factor: expected a number above 1, got {self.factor}")
+        if self.steps < 0 or self.margin < 0:
+            raise ValueError(f"steps, margin: expected at least 0, got {self.steps} and {self.margin}")
+
+    def factors(self) -> list[float]:
+        """Return the multiples of the identified time constant that are tried, in order."""
+        return [self.factor**k for k in range(-self.steps, self.steps + 1)]
 
 
 @dataclass(frozen=True)
@@ -85,7 +117,8 @@ class InverseControlParameters:
 
     def __post_init__(self) -> None:
         check_positive(self, "period", "horizon", "caution", "model_error", "duration")
-        Lag(self.time_constant)
+        if not 0.0 <= self.time_constant < math.inf:
+            raise ValueError(f"time_constant: expected a finite number of s, at least 0, got {self.time_constant}")
         if self.power not in (1.0, 2.0):
             raise ValueError(f"power: expected 1 or 2, got {self.power}")
 
@@ -151,7 +184,7 @@ class MuscleController(ControllerBase, ABC):
 class _Hypothesis:
     """A time constant, and what the model and its error are if it is the muscle's."""
 
-    lag: Lag
+    seen: SeenInput  # the voltage that would hold what the muscle has
     stream: TwoStageStream
     estimator: DisturbanceEstimator
     error: float = math.nan
@@ -180,7 +213,7 @@ class _Modelled(MuscleController):
         factors = p.search.factors() if self._searches and p.time_constant > 0.0 else [1.0]
         self._hypotheses = [
             _Hypothesis(
-                Lag(factor * p.time_constant, start.voltage**p.power, p.power),
+                SeenInput(ResponseDynamics(factor * p.time_constant, p.power), start.voltage),
                 model.stream(start),
                 DisturbanceEstimator(walk_variance=task.walk_variance, reading_variance=task.reading_variance),
             )
@@ -200,7 +233,7 @@ class _Modelled(MuscleController):
     @property
     def time_constant(self) -> float:
         """Time constant that agrees best with the readings so far, s."""
-        return self._hypotheses[self._likeliest].lag.time_constant
+        return self._hypotheses[self._likeliest].seen.response.lag
 
     @property
     def _believed(self) -> _Hypothesis:
@@ -209,14 +242,16 @@ class _Modelled(MuscleController):
 
     def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
         low, high = self._plausible_input
-        applied = measured_input if low <= measured_input <= high else self._setpoint
+        # A reading of 0 V may be less than that.
+        applied = max(measured_input, 0.0) if low <= measured_input <= high else self._setpoint
         passed = 0.0 if self._time is None else t - self._time
+        if passed < 0.0:
+            raise ValueError(f"t: expected a time not before {self._time}, got {t}")
         self._time = t
         search = self._parameters.search
         least, greatest = self._plausible_output
         for each in self._hypotheses:
-            each.lag = each.lag.advance(passed, applied)
-            self._task.advance(each.stream, each.lag.voltage, others)
+            self._task.advance(each.stream, each.seen.take(t, applied), others)
             if least <= output <= greatest:
                 error = output - self._task.output(each.stream)
                 each.estimator.update(error)
@@ -305,8 +340,8 @@ class MuscleClosedLoop(_Modelled):
 
     def _decide(self, output: float, *, first: bool) -> float:  # noqa: ARG002
         wanted = self._reference - self._believed.estimator.value
-        lag = self._believed.lag
-        present = lag.voltage
+        seen = self._believed.seen
+        present = seen.value
         error = wanted - self._modelled()
         least, greatest = sorted(error / (self._parameters.caution * slope) for slope in self._task.slopes)
         move = min(max(self._steady(wanted) - present, least), greatest)
@@ -316,7 +351,7 @@ class MuscleClosedLoop(_Modelled):
         elif error * self._error < 0.0 and abs(error) > max(_OVERSHOOT * abs(self._error), noise):
             self._part = max(_LEAST_PART, 0.5 * self._part)
         self._error = error
-        return lag.lead(self._clip(present + self._part * move), self._parameters.horizon, self.limits)
+        return seen.lead(self._clip(present + self._part * move), self._parameters.horizon, self.limits)
 
 
 @dataclass(frozen=True)

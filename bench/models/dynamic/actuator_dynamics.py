@@ -90,25 +90,51 @@ class ResponseDynamics:
 
 
 class SeenInput:
-    """The input as the hysteresis sees it, behind the lag of the response; at rest at the first reading.
+    """The input as the hysteresis sees it, behind the lag of the response.
 
     Parameters
     ----------
     response : ResponseDynamics
-        With a lag.
+        With the lag; without one the input is seen at once.
+    start : float
+        What is seen until the first reading, input units; nan for the input that is read there, as of an actuator at
+        rest.
     """
 
-    def __init__(self, response: ResponseDynamics) -> None:
-        self._response = response
-        self._level = self._time = math.nan
+    def __init__(self, response: ResponseDynamics, start: float = math.nan) -> None:
+        self.response = response
+        self._level, self._time = response.level(start), math.nan
+
+    @property
+    def value(self) -> float:
+        """The input that is seen at present, input units."""
+        return self.response.of_level(self._level)
 
     def take(self, t: float, measured: float) -> float:
         """Take a reading of the input at a time (s), which it has had since the last one; return what is seen."""
-        level, passed = self._response.level(measured), t - self._time
-        if not math.isnan(passed):
-            level += (self._level - level) * math.exp(-max(passed, 0.0) / self._response.lag)
+        level, passed = self.response.level(measured), t - self._time
+        if not math.isnan(self._level):
+            level += (self._level - level) * self._remains(0.0 if math.isnan(passed) else max(passed, 0.0))
         self._level, self._time = level, t
-        return self._response.of_level(level)
+        return self.value
+
+    def lead(self, target: float, horizon: float, limits: tuple[float, float]) -> float:
+        """Return the constant input that leads to what is to be seen within a time, as far as the limits allow.
+
+        Parameters
+        ----------
+        target : float
+            What is to be seen at the end, input units.
+        horizon : float
+            Time until then, s, > 0; the input exceeds its steady value the more, the shorter it is.
+        limits : tuple of float
+            Least and greatest input, input units.
+        """
+        wanted = self._level + (self.response.level(target) - self._level) / (1.0 - self._remains(horizon))
+        return min(max(self.response.of_level(wanted), limits[0]), limits[1])
+
+    def _remains(self, duration: float) -> float:
+        return math.exp(-duration / self.response.lag) if self.response.lag else 0.0
 
 
 @dataclass(frozen=True)

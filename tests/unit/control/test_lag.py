@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from cases import cases
+from hypothesis import given, strategies as st
 
 from bench.control import Spans
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
@@ -85,6 +86,21 @@ def test_the_seen_input_is_the_exact_response_to_a_drive_that_is_held(power):
     for t in np.linspace(0.7, 10.0, 9):
         last = seen.take(float(t), 4.0)
     assert last == pytest.approx(whole ** (1.0 / power), rel=1e-12)
+
+
+@given(st.floats(0.0, 3.0), st.floats(0.5, 20.0), st.floats(0.0, 3.0), st.floats(0.2, 20.0))
+def test_lead_meets_its_target_unless_clipped(start, lag, target, horizon):
+    limits = 0.0, 3.0
+    seen = SeenInput(ResponseDynamics(lag, 2.0), start)
+    lead = seen.lead(target, horizon, limits)
+    seen.take(0.0, start)
+    arrived = seen.take(horizon, lead)
+    if lead in limits:
+        # It falls short of the target, on the side where it comes from.
+        assert (arrived - target) * (start - target) >= -1e-12
+    else:
+        assert arrived**2 == pytest.approx(target**2, abs=1e-9)
+        assert limits[0] <= lead <= limits[1]
 
 
 def test_levels_keep_the_sign_of_the_input():

@@ -6,22 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given, strategies as st
 
 from bench.base import ConfigurationError, DataError
 from bench.control import ControllerSetup, ReachTarget
 from bench.identification import ModelFile, Series, identify_first_stage, identify_second_stage, voltage_steps
-from bench.models import IdentifiedDynamics, Preisach, Reach, ResponseDynamics, TwoStage, uniform_levels
+from bench.models import IdentifiedDynamics, Preisach, Reach, ResponseDynamics, SeenInput, TwoStage, uniform_levels
 from rigs.muscles.control import (
     FORCE_OPEN_LOOP,
     LENGTH_CLOSED_LOOP,
     InverseControlParameters,
+    LagSearch,
     MuscleClosedLoop,
     MuscleOpenLoop,
     MuscleProportionalIntegral,
     ProportionalIntegralParameters,
 )
-from rigs.muscles.lag import Lag, LagSearch
 from rigs.muscles.tasks import ForceTask, LengthTask
 from rigs.muscles.two_stage_inverse import TwoStageInverse
 from sim_devices.plants.sma import SMAParameters, SMAWire
@@ -160,6 +159,7 @@ def output_range(load=None):
 TIMING = InverseControlParameters(5.0, 1.0, 2.0)
 """What transients of the wire tell, and a search for other time constants; then without."""
 KNOWN = InverseControlParameters(5.0, 1.0, 2.0, search=LagSearch(steps=0))
+HEATED = ResponseDynamics(5.0, 2.0)
 NOISE = {"length": 0.02 * MILLIMETRE, "force": 0.02}
 MODEL_ERROR = 0.02
 
@@ -184,41 +184,6 @@ def controllers(inverse, load):
 
 def rms(errors):
     return np.sqrt(np.mean(np.square(errors), axis=0))
-
-
-# The thermal lag.
-
-
-@given(
-    st.floats(0.0, 9.0),
-    st.floats(0.5, 20.0),
-    st.floats(0.0, 3.0),
-    st.floats(0.0, 60.0),
-    st.floats(0.0, 1.0),
-)
-def test_lag_does_not_depend_on_how_time_is_split(level, time_constant, voltage, duration, part):
-    lag = Lag(time_constant, level)
-    first = part * duration
-    parts = lag.advance(first, voltage).advance(duration - first, voltage)
-    whole = lag.advance(duration, voltage)
-    assert parts.level == pytest.approx(whole.level, rel=1e-12, abs=1e-12)
-    assert whole.time_constant == time_constant
-    # The solution of dw/dt = (V² - w) / tau.
-    expected = voltage**2 + (level - voltage**2) * math.exp(-duration / time_constant)
-    assert whole.voltage == pytest.approx(math.sqrt(expected), abs=1e-9)
-
-
-@given(st.floats(0.0, 9.0), st.floats(0.5, 20.0), st.floats(0.0, 3.0), st.floats(0.2, 20.0))
-def test_lead_meets_its_target_unless_clipped(level, time_constant, target, horizon):
-    lag = Lag(time_constant, level)
-    voltage = lag.lead(target, horizon, LIMITS)
-    arrived = lag.advance(horizon, voltage).voltage
-    if voltage in LIMITS:
-        # It falls short of the target, on the side where it comes from.
-        assert (arrived - target) * (lag.voltage - target) >= -1e-12
-    else:
-        assert arrived**2 == pytest.approx(target**2, abs=1e-9)
-        assert LIMITS[0] <= voltage <= LIMITS[1]
 
 
 # On the plant.
@@ -338,16 +303,14 @@ def test_narrower_limits_are_kept_and_flagged(inverse):
 def test_memory_follows_what_the_supply_put_out_and_the_force_first(inverse):
     model, rng = inverse.model, np.random.default_rng(8)
     controller = MuscleClosedLoop(task(inverse, 4.9), KNOWN)
-    state, lag = model.initial_state(), Lag(5.0)
+    state, seen = model.initial_state(), SeenInput(HEATED, 0.0)
     times = np.cumsum(rng.uniform(0.5, 2.0, 30)).tolist()
     for n, t in enumerate(times):
         voltage, force = rng.uniform(0.0, 3.0), rng.uniform(1.0, 9.0)
-        if n > 0:
-            lag = lag.advance(t - times[n - 1], voltage)
         # The supply does not do what the controller asked for.
         ask = controller.update if n % 10 else lambda *reading: controller.aim(2e-4, *reading)
         ask(t, voltage, rng.uniform(-1e-3, 2e-3), force)
-        state, _ = model.step(state, lag.voltage, force)
+        state, _ = model.step(state, seen.take(t, voltage), force)
         assert controller.state == state
 
 
@@ -361,10 +324,10 @@ def test_the_argument_stays_between_fixed_ends(inverse):
     for n in range(1, 20):
         held = controller.update(float(n), command.setpoint, 9.9)
         assert (held.setpoint, held.done) == (command.setpoint, False)
-    lag = Lag(5.0, 1.0)
-    for _ in range(19):
-        lag = lag.advance(1.0, command.setpoint)
-    assert controller.state == model.move(state, lag.voltage, state.argument)[0]
+    seen = SeenInput(HEATED, 1.0)
+    for n in range(20):
+        seen.take(float(n), command.setpoint if n else 1.0)
+    assert controller.state == model.move(state, seen.value, state.argument)[0]
     assert controller.trace.reference == 5.0
     assert controller.trace.predicted == controller.state.force
     assert math.isnan(controller.trace.disturbance)
@@ -374,13 +337,14 @@ def test_an_exact_model_is_led_to_the_target(inverse):
     model = inverse.model
     # Slopes of any size are believed: the model is the wire.
     controller = MuscleClosedLoop(replace(task(inverse, None), slopes=(1e-3, 1e3)), KNOWN)
-    state, lag, t, voltage = model.initial_state(), Lag(5.0), 0.0, 0.0
+    state, seen, t, voltage = model.initial_state(), SeenInput(HEATED), 0.0, 0.0
+    seen.take(t, voltage)
     for target in (4.0, 6.0, 5.0, 8.0, 7.0):
         command = controller.aim(target, t, voltage, state.force)
         while not command.done:
             voltage = command.setpoint
-            lag, t = lag.advance(command.wait, voltage), t + command.wait
-            state, _ = model.move(state, lag.voltage, state.argument)
+            t += command.wait
+            state, _ = model.move(state, seen.take(t, voltage), state.argument)
             command = controller.update(t, voltage, state.force)
         assert state.force == pytest.approx(target, abs=2e-3)
         assert controller.reach is Reach.MET
@@ -393,15 +357,16 @@ def test_missing_readings(inverse):
     before = controller.trace.disturbance, controller.trace.uncertainty
     after = controller.update(1.0, nan, nan, nan)
     # The supply is taken to have done what it was told, the load to be the same; the wire is not left to overheat.
-    lag = Lag(5.0).advance(1.0, command.setpoint)
-    assert controller.state.voltage == lag.voltage
+    seen = SeenInput(HEATED)
+    seen.take(0.0, 0.0)
+    assert controller.state.voltage == seen.take(1.0, command.setpoint)
     assert controller.state.force == 4.9
     assert (controller.trace.disturbance, controller.trace.uncertainty) == before
     assert math.isfinite(after.setpoint)
     # Nonsense is missing too.
     controller.update(2.0, 1e6, 5.0, 1e9)
     assert controller.state.force == 4.9
-    assert controller.state.voltage == lag.advance(1.0, after.setpoint).voltage
+    assert controller.state.voltage == seen.take(2.0, after.setpoint)
     assert (controller.trace.disturbance, controller.trace.uncertainty) == before
     plain = MuscleProportionalIntegral(LIMITS, ProportionalIntegralParameters(1.0, 4.0, 1.0))
     assert plain.aim(5.0, 0.0, 1.5, nan).setpoint == 1.5
@@ -451,12 +416,7 @@ def test_lasts_its_time_and_then_holds(inverse, name):
 @cases(
     ("make", "message"),
     [
-        (lambda: Lag(-1.0), "time_constant: expected a finite"),
-        (lambda: Lag(5.0, -1.0), "level: expected a finite"),
-        (lambda: Lag(5.0, math.nan), "level: expected a finite"),
-        (lambda: Lag(5.0).advance(-1.0, 1.0), "duration: expected a finite number"),
-        (lambda: Lag(5.0).advance(1.0, math.nan), "voltage: expected a finite"),
-        (lambda: Lag(5.0).lead(-1.0, 2.0, LIMITS), "target: expected a finite number of V"),
+        (lambda: InverseControlParameters(-1.0, 1.0, 2.0), "time_constant: expected a finite"),
         (lambda: InverseControlParameters(5.0, 1.0, 0.0), "horizon: expected a positive"),
         (lambda: InverseControlParameters(5.0, 1.0, 2.0, duration=math.inf), "duration: expected a positive"),
         (lambda: InverseControlParameters(5.0, 1.0, 2.0, 3.0), "power: expected 1 or 2"),
@@ -502,7 +462,7 @@ def test_time_does_not_go_back_and_targets_come_first(inverse):
     with pytest.raises(RuntimeError, match="expected a target first"):
         controller.update(0.0, 0.0, 0.3)
     controller.aim(5.0, 10.0, 0.0, 0.3)
-    with pytest.raises(ValueError, match="duration: expected a finite number"):
+    with pytest.raises(ValueError, match="t: expected a time not before"):
         controller.update(9.0, 0.0, 0.3)
 
 
