@@ -12,6 +12,7 @@ from bench.analysis.tables.dataset import Dataset
 from bench.base import Floats, header_with_unit, prefixed
 from bench.identification import (
     Band,
+    Candidate,
     Identification,
     ModelFile,
     Regularization,
@@ -99,7 +100,6 @@ def calibrate(
         return calibrate_band_in_time(found, data.times, inputs, outputs, weights=weights, skip=skip, **options)
     own = dict(options)
     initial, orientation = own.pop("initial", None), own.pop("orientation", "auto")
-    problem = set_up_problem(
-        found.model_name, inputs, outputs, weights, skip, penalties.smoothing, initial, own, orientation=orientation
-    )
+    settings = Candidate(found.model_name, own, orientation, initial, penalties.smoothing)
+    problem = set_up_problem(settings, inputs, outputs, weights, skip)
     return calibrate_band(problem, penalties.smoothing, penalties.ridge)

@@ -14,6 +14,7 @@ from .branches import (
     turning_points as turning_points,
 )
 from .by_name import (
+    Candidate as Candidate,
     Identification as Identification,
     Initial as Initial,
     check_words as check_words,
@@ -32,7 +33,6 @@ from .choose.rule import (
     select as select,
 )
 from .choose.score import (
-    Candidate as Candidate,
     Measurements as Measurements,
     Score as Score,
     evaluate as evaluate,

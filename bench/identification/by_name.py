@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -38,6 +38,48 @@ INITIALS: tuple[Initial, ...] = ("negative", "positive", "skip", "estimate")
 # Relative step of the differences by shape parameters. Derivation: the root of 1e-12, to which a constrained linear
 # fit is exact.
 _STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model and the settings of its identification.
+
+    Attributes
+    ----------
+    model : str
+        Name of the operator in `bench.models`.
+    options : mapping of str to object
+        Options of the operator, as `identify` takes them.
+    orientation : str
+        Whether the output rises or falls with the input; `auto` leaves it to the fit, or to a model without signs.
+    initial : str or None
+        Memory before the first sample, as `identify` takes it.
+    smoothing, ridge : float or None
+        Weights of the penalties; None leaves them to the fit of a density of either sign.
+    dynamics : str
+        What follows the operator in time, as `identify_hammerstein` takes it; empty for the operator alone.
+    shape : tuple of float
+        Shape parameters of the operator; empty if they are to be found.
+    parameters : mapping of str to float
+        Nonlinear parameters of what follows the operator from which their search starts; others have several starts.
+    """
+
+    model: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    orientation: Orientation = "auto"
+    initial: Initial | None = None
+    smoothing: float | None = 0.0
+    ridge: float | None = 0.0
+    dynamics: str = ""
+    shape: tuple[float, ...] = ()
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def fitted(self) -> tuple[str, dict[str, Any]]:
+        """Name and options of the model that is identified: with dynamics, of a Hammerstein model."""
+        if not self.dynamics:
+            return self.model, dict(self.options)
+        return "hammerstein", {"static": self.model, **self.options, "dynamics": self.dynamics}
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +188,8 @@ def identify(
     ValueError
         If the name is unknown, an option does not belong to it, or the data are unfit; see `fit`.
     """
-    problem = set_up_problem(
-        model_name, inputs, outputs, weights, skip, smoothing or 0.0, initial, options, orientation=orientation
-    )
+    settings = Candidate(model_name, options, orientation, initial, smoothing, ridge)
+    problem = set_up_problem(settings, inputs, outputs, weights, skip)
     penalties = problem.regularization(smoothing, ridge)
     solution = problem.fit(penalties.smoothing, ridge=penalties.ridge)
     is_penalised = not problem.spec.constrained and (penalties.smoothing > 0.0 or penalties.ridge > 0.0)
@@ -271,44 +312,43 @@ class FitProblem:
 
 
 def set_up_problem(
-    model_name: str,
-    inputs: ArrayLike,
-    outputs: ArrayLike,
-    weights: ArrayLike | None,
-    skip: int,
-    smoothing: float,
-    initial: Initial | None,
-    options: dict[str, Any],
-    *,
-    orientation: Orientation = "auto",
-    shape: Sequence[float] = (),
+    settings: Candidate, inputs: ArrayLike, outputs: ArrayLike, weights: ArrayLike | None = None, skip: int = 0
 ) -> FitProblem:
-    """Return the problem that `identify` solves; its arguments are those of `identify`.
+    """Return the problem that `identify` solves.
 
-    Shape parameters are found from the data, unless they are given because an earlier set-up found them.
+    Parameters
+    ----------
+    settings : Candidate
+        Model and settings. Its shape parameters are found from the data, unless the settings have them.
+    inputs, outputs, weights, skip
+        As in `identify`.
+
+    Raises
+    ------
+    ValueError
+        As `identify`.
     """
-    spec = find_model(model_name)
+    name, initial, spec = settings.model, settings.initial, find_model(settings.model)
     sequence = _checks.samples("inputs", inputs)
     measured = _checks.counted("outputs", outputs, sequence.size, "values, one for each input")
     w = counted_weights(sequence.size, weights, skip=0)
-    check_words(initial, orientation)
+    check_words(initial, settings.orientation)
     if initial == "estimate" and spec.estimate_state is None:
-        raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
-    check_options(model_name, options)
+        raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {name}")
+    check_options(name, settings.options)
     # Its range is that of the rows that are fitted: nothing is known of the output beyond it.
-    template = template_of(spec, sequence[w > 0.0], options)
+    template = template_of(spec, sequence[w > 0.0], settings.options)
     record = record_of(w)
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence[record]))
         check_skipped(record.stop, skip, template.coefficients.size, spec.estimate_state is not None)
     counted = counted_weights(sequence.size, w, skip)
     check_record(sequence[record], measured[record], skip)
-    signs = possible_signs(orientation, model_name, spec, template, sequence, measured, counted)
-    problems = {
-        sign: _orient(sign, spec, template, sequence, measured, w, skip, smoothing, initial, shape) for sign in signs
-    }
+    signs = possible_signs(settings.orientation, name, spec, template, sequence, measured, counted)
+    problems = {sign: _orient(sign, settings, spec, template, sequence, measured, w, skip) for sign in signs}
     if len(problems) == 1:
         return problems[signs[0]]
+    smoothing = settings.smoothing or 0.0
     fits = {sign: problem.fit(smoothing) for sign, problem in problems.items()}
     rising, falling = (problems[sign].cost(fits[sign]) for sign in signs)
     best = better_sign(rising, falling, measured, counted)
@@ -332,18 +372,16 @@ def _listed(words: Sequence[str]) -> str:
 
 def _orient(
     sign: Sign,
+    settings: Candidate,
     spec: ModelSpec,
     template: Operator[Any],
     inputs: Floats,
     outputs: Floats,
     weights: Floats,
     skip: int,
-    smoothing: float,
-    initial: Initial | None,
-    shape: Sequence[float],
 ) -> FitProblem:
     """Return the problem with the output of one sign, its initial memory and its shape found from the data."""
-    measured = outputs if sign > 0 else -outputs
+    measured, initial, smoothing = outputs if sign > 0 else -outputs, settings.initial, settings.smoothing or 0.0
     state: Any = None
     if initial == "estimate":
         assert spec.estimate_state is not None
@@ -359,4 +397,4 @@ def _orient(
     before = start(template)
     regressor = template.regressor(inputs, before)
     problem = FitProblem(spec, inputs, outputs, weights, skip, template, before, regressor, start, sign)
-    return problem.with_shape(shape) if shape else problem.with_best_shape(smoothing)
+    return problem.with_shape(settings.shape) if settings.shape else problem.with_best_shape(smoothing)

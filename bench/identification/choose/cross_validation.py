@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats
-from bench.identification.by_name import Initial, set_up_problem
+from bench.identification.by_name import Candidate, Initial, set_up_problem
 from bench.identification.choose.splits import FOLDS, SMOOTHING_BLOCKS, Fold, block_folds
 from bench.identification.fit.least_squares import Fit, counted_weights
 from bench.identification.fit.orientation import Orientation
@@ -97,10 +97,8 @@ def cross_validate(
     trials: list[Regularization] = []
     for order in levels if levels is not None else [None]:
         chosen = options if order is None else {**options, "levels": order}
-        problem = set_up_problem(
-            model_name, inputs, outputs, weights, skip, max(smoothing, default=0.0), initial, chosen,
-            orientation=orientation,
-        )  # fmt: skip
+        settings = Candidate(model_name, chosen, orientation, initial, max(smoothing, default=0.0))
+        problem = set_up_problem(settings, inputs, outputs, weights, skip)
         counts = np.where(np.arange(problem.outputs.size) < problem.skip, 0.0, problem.weights)
 
         fit = partial(problem.fit, ridge=ridge)

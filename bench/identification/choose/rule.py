@@ -22,9 +22,9 @@ import numpy as np
 
 from bench.base import say_share, shares_to
 from bench.identification.advice import Advice, advise_on_record
-from bench.identification.by_name import Initial
+from bench.identification.by_name import Candidate, Initial
 from bench.identification.choose.cross_validation import EQUAL
-from bench.identification.choose.score import SCORING, Candidate, Measurements, Score, evaluate
+from bench.identification.choose.score import SCORING, Measurements, Score, evaluate
 from bench.identification.choose.splits import has_one_kind
 from bench.identification.fit.orientation import Orientation, has_orientation
 from bench.identification.options import UNITS, template_of

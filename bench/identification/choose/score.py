@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.base import BenchError, Floats, say_share
 from bench.identification.branches import turning_points
-from bench.identification.by_name import FitProblem, Initial, set_up_problem
+from bench.identification.by_name import Candidate, FitProblem, set_up_problem
 from bench.identification.choose.splits import (
     BLOCKS,
     GAP,
@@ -26,7 +25,7 @@ from bench.identification.choose.splits import (
     run_folds,
 )
 from bench.identification.fit.least_squares import Fit, one_thread
-from bench.identification.fit.orientation import NAMES, Orientation, Sign, has_orientation
+from bench.identification.fit.orientation import NAMES, Sign, has_orientation
 from bench.identification.timed.hammerstein_fit import reshape, set_up_search
 from bench.identification.timed.hammerstein_search import Search, find_best
 from bench.models import Regressor, overwritten_from
@@ -49,48 +48,6 @@ mistake in the program."""
 
 SCORING = "scoring"
 """Stage of which `evaluate` says the share that is done."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A model and the settings of its identification.
-
-    Attributes
-    ----------
-    model : str
-        Name of the operator in `bench.models`.
-    options : mapping of str to object
-        Options of the operator, as `identify` takes them.
-    orientation : str
-        Whether the output rises or falls with the input; `auto` leaves it to the fit, or to a model without signs.
-    initial : str or None
-        Memory before the first sample, as `identify` takes it.
-    smoothing, ridge : float or None
-        Weights of the penalties; None leaves them to the fit of a density of either sign.
-    dynamics : str
-        What follows the operator in time, as `identify_hammerstein` takes it; empty for the operator alone.
-    shape : tuple of float
-        Shape parameters of the operator; empty if they are to be found.
-    parameters : mapping of str to float
-        Nonlinear parameters of what follows the operator from which their search starts; others have several starts.
-    """
-
-    model: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    orientation: Orientation = "auto"
-    initial: Initial | None = None
-    smoothing: float | None = 0.0
-    ridge: float | None = 0.0
-    dynamics: str = ""
-    shape: tuple[float, ...] = ()
-    parameters: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def fitted(self) -> tuple[str, dict[str, Any]]:
-        """Name and options of the model that is identified: with dynamics, of a Hammerstein model."""
-        if not self.dynamics:
-            return self.model, dict(self.options)
-        return "hammerstein", {"static": self.model, **self.options, "dynamics": self.dynamics}
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +225,7 @@ def evaluate(measured: Measurements, candidates: Sequence[Candidate], *, reshape
     """
     scores: list[Score] = []
     problems: dict[str, _Problem] = {}
-    searches: dict[str, tuple[FitProblem, Search]] = {}
+    searches: dict[str, Search] = {}
     for place, candidate in enumerate(candidates):
         begin = time.process_time()
         # The search for what follows an operator depends on its penalties.
@@ -331,18 +288,7 @@ def _score(measured: Measurements, candidate: Candidate, problem: _Problem, say:
 
 
 def _set_up(measured: Measurements, candidate: Candidate, *, reshaped: bool) -> _Problem:
-    problem = set_up_problem(
-        candidate.model,
-        measured.inputs,
-        measured.outputs,
-        measured.fitted.astype(np.float64),
-        0,
-        candidate.smoothing or 0.0,
-        candidate.initial,
-        dict(candidate.options),
-        orientation=candidate.orientation,
-        shape=candidate.shape,
-    )
+    problem = set_up_problem(candidate, measured.inputs, measured.outputs, measured.fitted.astype(np.float64))
     _check_skipped(measured, problem)
     if reshaped and candidate.shape:
         problem = problem.with_best_shape(candidate.smoothing or 0.0, [candidate.shape])
@@ -359,27 +305,15 @@ def _set_up(measured: Measurements, candidate: Candidate, *, reshaped: bool) -> 
 
 
 def _set_up_in_time(
-    measured: Measurements, candidate: Candidate, searches: dict[str, tuple[FitProblem, Search]], *, reshaped: bool
+    measured: Measurements, candidate: Candidate, searches: dict[str, Search], *, reshaped: bool
 ) -> _Problem:
     assert measured.times is not None
     static = repr(replace(candidate, dynamics="", parameters={}))
     if static not in searches:
-        searches[static] = set_up_search(
-            measured.times,
-            measured.inputs,
-            measured.outputs,
-            measured.fitted.astype(np.float64),
-            0,
-            candidate.initial,
-            candidate.orientation,
-            static=candidate.model,
-            options=candidate.options,
-            smoothing=candidate.smoothing or 0.0,
-            ridge=candidate.ridge or 0.0,
-            shape=candidate.shape,
-        )
-    problem, search = searches[static]
-    _check_skipped(measured, problem)
+        weights = measured.fitted.astype(np.float64)
+        searches[static] = set_up_search(candidate, measured.times, measured.inputs, measured.outputs, weights)
+    search = searches[static]
+    _check_skipped(measured, search.static)
     elements = tuple(candidate.dynamics.split(","))
     found = find_best(search, elements, candidate.parameters, rounds=1)
     if reshaped or not candidate.shape:
@@ -391,7 +325,7 @@ def _set_up_in_time(
 
     best = replace(_found(candidate, search.static, sign), parameters=search.named(found))
     count = found.values.size + search.static.template.count_beside_coefficients()
-    return _Problem(best, responses.regressor, fit, problem.skip, count, found.fit)
+    return _Problem(best, responses.regressor, fit, search.static.skip, count, found.fit)
 
 
 def _found(candidate: Candidate, problem: FitProblem, sign: Sign) -> Candidate:

@@ -8,7 +8,7 @@ leaves free, in turns with that fit, from several starts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any, Literal
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats
 from bench.identification.advice import Advice
-from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
+from bench.identification.by_name import Candidate, FitProblem, Identification, Initial, set_up_problem
 from bench.identification.choose.cross_validation import compare_smoothing
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
@@ -112,21 +112,10 @@ def identify_hammerstein(
     moments, sequence, measured = check_sequence(times, inputs=inputs, outputs=outputs)
     chosen = None if dynamics is None else _elements(dynamics)
     tried = [float(weight) for weight in np.atleast_1d(np.asarray(smoothing, dtype=np.float64))]
-    problem, search = set_up_search(
-        moments,
-        sequence,
-        measured,
-        weights,
-        skip,
-        initial,
-        orientation,
-        static=static,
-        options=options,
-        # What follows the operator hardly depends on the weight; without any a fine plane takes it for hysteresis.
-        smoothing=tried[len(tried) // 2],
-        ridge=ridge,
-    )
-    advice = list(problem.advice())
+    # What follows the operator hardly depends on the weight; without any a fine plane takes it for hysteresis.
+    settings = Candidate(static, options, orientation, initial, tried[len(tried) // 2], ridge)
+    search = set_up_search(settings, moments, sequence, measured, weights, skip)
+    advice = list(search.static.advice())
     penalties = Regularization(tried[0], 0.0) if any(tried) else None
     with one_thread():
         search, found = choose_elements(search) if chosen is None else reshape(search, find_best(search, chosen, {}))
@@ -195,35 +184,18 @@ def with_element(elements: Sequence[str], element: str) -> tuple[str, ...]:
 
 
 def set_up_search(
+    settings: Candidate,
     times: Floats,
     inputs: Floats,
     outputs: Floats,
-    weights: ArrayLike | None,
-    skip: int,
-    initial: Initial | None,
-    orientation: Orientation,
-    *,
-    static: str,
-    options: Mapping[str, Any],
-    smoothing: float = 0.0,
-    ridge: float = 0.0,
-    shape: Sequence[float] = (),
-) -> tuple[FitProblem, Search]:
-    """Return the problem of the operator alone, and the search for what follows it; see `identify_hammerstein`."""
+    weights: ArrayLike | None = None,
+    skip: int = 0,
+) -> Search:
+    """Return the search for what follows an operator, whose settings these are; see `identify_hammerstein`."""
+    static, smoothing, ridge = settings.model, settings.smoothing or 0.0, settings.ridge or 0.0
     if static == "preisach":
-        options = {"reversible": "linear", **options}
-    problem = set_up_problem(
-        static,
-        inputs,
-        outputs,
-        weights,
-        skip,
-        smoothing,
-        initial,
-        dict(options),
-        orientation=orientation,
-        shape=shape,
-    )
+        settings = replace(settings, options={"reversible": "linear", **settings.options})
+    problem = set_up_problem(settings, inputs, outputs, weights, skip)
     if smoothing and not problem.regressor.base.size:
         raise ValueError(f"smoothing: {static} has no cells of a density")
     if ridge and (problem.spec.constrained or problem.regressor.base.size):
@@ -231,10 +203,12 @@ def set_up_search(
     check_size(*problem.regressor.shape, "levels")
     # The output of a lag may fall while the operator rises: the sign is found with the linear part.
     oriented = has_orientation(problem.spec, problem.template)
-    signs: tuple[Literal[1, -1], ...] = (1, -1) if oriented and orientation == "auto" else (problem.orientation,)
+    signs: tuple[Literal[1, -1], ...] = (
+        (1, -1) if oriented and settings.orientation == "auto" else (problem.orientation,)
+    )
     roots = np.sqrt(problem.weights)
     roots[: problem.skip] = 0.0
-    return problem, Search(times, problem, problem.regressor.dense(), roots, signs, smoothing, ridge)
+    return Search(times, problem, problem.regressor.dense(), roots, signs, smoothing, ridge)
 
 
 def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> Regularization:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats
 from bench.identification.advice import Advice
-from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
+from bench.identification.by_name import Candidate, FitProblem, Identification, Initial, set_up_problem
 from bench.identification.fit.cell_layout import CellLayout
 from bench.identification.fit.least_squares import Fit, fit_cells, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation
@@ -77,9 +77,8 @@ class PlaysSearch:
         **options: object,
     ) -> PlaysSearch:
         """Return the search for a measured sequence; arguments and errors as `identify_rate_dependent_plays`."""
-        static = set_up_problem(
-            "prandtl-ishlinskii", inputs, outputs, weights, skip, 0.0, initial, options, orientation=orientation
-        )
+        settings = Candidate("prandtl-ishlinskii", options, orientation, initial)
+        static = set_up_problem(settings, inputs, outputs, weights, skip)
         check_size(times.size, (1 + _MOST) * static.template.coefficients.size, "plays")
         return cls(times, static)
 

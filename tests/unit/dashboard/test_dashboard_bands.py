@@ -11,7 +11,7 @@ import bench as bench_functions
 from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
-from bench.identification import ModelFile, calibrate_band, identify, input_half_widths, set_up_problem
+from bench.identification import Candidate, ModelFile, calibrate_band, identify, input_half_widths, set_up_problem
 from bench.protocol import TRACES, Settled
 from bench.record import StepRecord
 from bench.rig import DashboardLayout
@@ -54,7 +54,7 @@ def model():
     outputs = measured("duhem", inputs, rng)
     options = {"levels": 12, "input_unit": "V", "output_unit": "mm"}
     found = identify("preisach", inputs, outputs, **options)
-    band = calibrate_band(set_up_problem("preisach", inputs, outputs, None, 0, 0.0, None, options))
+    band = calibrate_band(set_up_problem(Candidate("preisach", options), inputs, outputs))
     return ModelFile("preisach", found.model, provenance={"input": "v", "output": "y"}, band=band)
 
 

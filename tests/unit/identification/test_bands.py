@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from other_plants import STEP, measured, random_reversals
 
-from bench.identification import Band, calibrate_band, ramps, set_up_problem
+from bench.identification import Band, Candidate, calibrate_band, ramps, set_up_problem
 
 PREISACH = ("preisach", {"levels": 20, "plane": (-1.0, 1.0), "reversible": "linear"})
 PLAYS = ("prandtl-ishlinskii", {})
@@ -14,7 +14,7 @@ PLAYS = ("prandtl-ishlinskii", {})
 
 def calibrated(model, inputs, outputs, **options):
     name, given = model
-    problem = set_up_problem(name, inputs, outputs, None, options.pop("skip", 0), 0.0, None, dict(given))
+    problem = set_up_problem(Candidate(name, given), inputs, outputs, skip=options.pop("skip", 0))
     found = problem.fit(0.0)
     return problem.template.with_coefficients(found.coefficients, found.bias), calibrate_band(problem, **options)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.identification import check_data, cross_validate, fit, identify, ramps, set_up_problem
+from bench.identification import Candidate, check_data, cross_validate, fit, identify, ramps, set_up_problem
 from bench.models import MemoryCurve, PrandtlIshlinskii, Preisach, uniform_levels
 
 
@@ -109,7 +109,7 @@ def test_each_fold_is_predicted_without_it():
     plane = inputs.min(), inputs.max()
     table = cross_validate("preisach", inputs, outputs, levels=(3, 4), skip=10, plane=plane)
     assert [trial.levels for trial in table.trials] == [3, 4]
-    problem = set_up_problem("preisach", inputs, outputs, None, 10, 0.0, None, {"levels": 4, "plane": plane})
+    problem = set_up_problem(Candidate("preisach", {"levels": 4, "plane": plane}), inputs, outputs, skip=10)
     block = np.arange(inputs.size - 10) * 20 // (inputs.size - 10)
     squares = np.empty(inputs.size - 10)
     for fold in range(5):
