@@ -163,7 +163,7 @@ class DisturbanceEstimator:
         if not 0 < first < math.inf:
             raise ValueError(f"initial_variance: expected a positive number, got {initial_variance}")
         self._value = 0.0
-        self._variance = self._first = first
+        self._variance = first
         self._walk, self._noise = walk_variance, reading_variance
 
     def update(self, value: float | None) -> float:
@@ -194,10 +194,6 @@ class DisturbanceEstimator:
     def shift(self, difference: float) -> None:
         """Take note that the prediction fell by a difference (output units), as that of a corrected model does."""
         self._value += difference
-
-    def reset(self) -> None:
-        """Forget everything."""
-        self._value, self._variance = 0.0, self._first
 
     @property
     def value(self) -> float:

@@ -130,29 +130,22 @@ class SmoothMoves:
                 f"speed, blend, hold: expected positive numbers (hold may be 0), got {speed}, {blend} and {hold}"
             )
         self._blend = blend
-        self._places: list[float] = places.tolist()
         moves = np.diff(places)
-        self._speeds: list[float] = (np.sign(moves) * speed).tolist()
-        self._cruises: list[float] = (np.abs(moves) / speed).tolist()
         # A move takes its time at top speed and one blend.
         ends = np.cumsum(np.abs(moves) / speed + blend + hold)
-        self._starts: list[float] = [0.0, *ends.tolist()[:-1]]
-        cruises = [cruise / blend for cruise in self._cruises]
-        rises = [each * blend for each in self._speeds]
+        starts, spots = [0.0, *ends.tolist()[:-1]], places.tolist()
+        cruises, rises = (np.abs(moves) / speed / blend).tolist(), (np.sign(moves) * speed * blend).tolist()
+        self._starts: list[float] = starts
         # Of each move: start, time at top speed in blends, places before and behind, rise in a blend at top speed.
         self._moves: list[tuple[float, float, float, float, float]] = list(
-            zip(self._starts, cruises, self._places, self._places[1:], rises, strict=False)
+            zip(starts, cruises, spots, spots[1:], rises, strict=False)
         )
         self.duration = float(ends[-1])
         """Time to the end of the last hold, s."""
 
-    def _move(self, t: float) -> int:
-        """Return the number of the last move that has begun."""
-        return bisect_right(self._starts, t, 1) - 1
-
     def __call__(self, t: float) -> float:
         """Return the position at a time (s), output units; it rests before the start and after the end."""
-        # As `_move` and `_blended` do, without their calls: a fast loop asks several times for each sample.
+        # Few calls, as a fast loop asks several times for each sample.
         start, cruise, before, behind, rise = self._moves[bisect_right(self._starts, t, 1) - 1]
         x = (t - start) / self._blend
         if x >= cruise + 1.0:
@@ -160,17 +153,6 @@ class SmoothMoves:
         begun = x - 0.5 if x >= 1.0 else _blended(x)
         ended = _blended(x - cruise) if x > cruise else 0.0
         return before + rise * (begun - ended)
-
-    def rate(self, t: float) -> float:
-        """Return the speed at a time (s), output units per second."""
-        k = self._move(t)
-        x, cruise = (t - self._starts[k]) / self._blend, self._cruises[k] / self._blend
-        return self._speeds[k] * (_blend(x) - _blend(x - cruise))
-
-    def holding(self, t: float, settling: float = 0.0) -> bool:
-        """Return whether the last move ended at least a settling time (s) before a time (s)."""
-        k = self._move(t)
-        return t - self._starts[k] >= self._cruises[k] + self._blend + settling
 
 
 def staircase(

@@ -161,14 +161,6 @@ class Assessment:
     log_determinant: float
     prediction_variance: float
 
-    def summary(self) -> str:
-        """Return the assessment in one line."""
-        return (
-            f"{self.setpoints} set-points, {self.time / 3600.0:.2f} h: {self.covered} of {self.cells} cells covered, "
-            f"rank {self.rank} of {self.coefficients}, condition {self.condition:.3g}, "
-            f"log10 det per hour {self.log_determinant:.3f}, prediction variance {self.prediction_variance:.3g}"
-        )
-
 
 def assess(operator: Preisach, inputs: ArrayLike, *, dwell: float) -> Assessment:
     """Return what a sequence tells about the coefficients of an operator, from negative saturation on.

@@ -42,10 +42,6 @@ class Resolution:
     rank: int
     diagonal: Floats
 
-    def summary(self) -> str:
-        """Return the rank in words."""
-        return f"rank {self.rank} of {self.diagonal.size}"
-
 
 def resolve(
     regressor: Regressor, weights: Floats, skip: int = 0, smoothing: float = 0.0, ridge: float = 0.0

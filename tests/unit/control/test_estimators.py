@@ -42,9 +42,6 @@ class TestAgainstClosedForm:
         estimator = DisturbanceEstimator(walk_variance=3.0, reading_variance=1.0)
         assert estimator.value == 0.0
         assert estimator.update(42.0) == pytest.approx(42.0, rel=1e-8)
-        estimator.reset()
-        assert estimator.value == 0.0
-        assert estimator.update(-7.0) == pytest.approx(-7.0, rel=1e-8)
 
     def test_the_uncertainty_is_that_of_a_random_walk_seen_through_noise(self):
         rng = np.random.default_rng(5)

@@ -51,7 +51,6 @@ def test_a_constant_record_determines_nothing():
     operator = Preisach(uniform_levels(-1.0, 1.0, 4), np.zeros(10))
     found = resolve(operator.regressor(np.zeros(5)), np.ones(5))
     assert (found.rank, found.diagonal.max()) == (0, 0.0)
-    assert found.summary() == "rank 0 of 10"
 
 
 @settings(max_examples=40)
