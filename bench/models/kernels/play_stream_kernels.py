@@ -1,19 +1,40 @@
-"""Compiled step of a stream of plays between two maps, see `element_stream_kernels`. Imported on first use only."""
+"""Compiled step of a stream of plays between two maps, see `stream_kernels`. Imported on first use only."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+from numba import carray  # type: ignore[attr-defined]
+from numpy.typing import NDArray
+
 from bench.base import inlined, kernel
-from bench.models.kernels import element_stream_kernels as elements, memory_kernels as memory
+from bench.models.kernels import memory_kernels as memory
+from bench.models.kernels.stream_kernels import pointer
+
+Floats = NDArray[np.float64]
+Words = NDArray[np.int64]
+
+# Words: addresses of the arrays, the last two of the maps, then the numbers of plays and of the dead zones of either
+# map. Derivation: the count is that of the names.
+NUMBERS, PLAYS, THRESHOLDS, WEIGHTS, BEFORE, AFTER, COUNT, BEFORE_COUNT, AFTER_COUNT = range(9)
+WORD_COUNT = 9
+# Numbers: the present output, the bias and the origin. Derivation: the count is that of the names.
+OUTPUT, BIAS, ORIGIN = range(3)
+NUMBER_COUNT = 3
 
 
 @inlined
-def _mapped(x: float, words: elements.Words, place: int, count: int) -> float:
+def _array(words: Words, place: int, size: int) -> Floats:
+    return carray(pointer(words[place]), size, np.float64)
+
+
+@inlined
+def _mapped(x: float, words: Words, place: int, count: int) -> float:
     """Return a map of dead zones at x, by its thresholds, intercepts and slopes; without one, of -1, x itself."""
     if count < 0:
         return x
-    parts = elements.array(words, place, 3 * count + 2)
+    parts = _array(words, place, 3 * count + 2)
     k = 0
     while k < count and x > parts[k]:
         k += 1
@@ -23,12 +44,15 @@ def _mapped(x: float, words: elements.Words, place: int, count: int) -> float:
 
 @kernel
 def step_plays(address: int, value: float) -> float:
-    """Step plays between two maps; thresholds, weights and lines of the maps; the origin, and sizes of the maps."""
+    """Move to an input and return the output; nan, without a move, if the input is not finite."""
     if not math.isfinite(value):
         return math.nan
-    words, numbers, states = elements.opened(address)
-    x = elements.one(_mapped(value - numbers[elements.OWN], words, elements.THIRD, int(numbers[elements.OWN + 1])))
-    thresholds = elements.array(words, elements.FIRST, states.size)
-    weights = elements.array(words, elements.SECOND, states.size)
-    total = memory.weighted_plays(x, thresholds, weights, states)[0]
-    return elements.moved(numbers, value, _mapped(total, words, elements.FOURTH, int(numbers[elements.OWN + 2])))
+    words = carray(pointer(address), WORD_COUNT, np.int64)
+    numbers, count = _array(words, NUMBERS, NUMBER_COUNT), words[COUNT]
+    x = np.empty(1)
+    x[0] = _mapped(value - numbers[ORIGIN], words, BEFORE, words[BEFORE_COUNT])
+    thresholds, weights = _array(words, THRESHOLDS, count), _array(words, WEIGHTS, count)
+    total = memory.weighted_plays(x, thresholds, weights, _array(words, PLAYS, count))[0]
+    output: float = numbers[BIAS] + _mapped(total, words, AFTER, words[AFTER_COUNT])
+    numbers[OUTPUT] = output
+    return output

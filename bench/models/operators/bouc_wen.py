@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Shape
-from bench.models.operators.elements import CompiledStep, ElementOperator
+from bench.models.operators.elements import ElementOperator
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +97,6 @@ class BoucWen(ElementOperator):
         )
         elements[0] = z[-1]
         return np.column_stack([inputs - self.origin, z])
-
-    def compiled_step(self) -> CompiledStep:
-        """Return the compiled step; see `ElementOperator.compiled_step`."""
-        return CompiledStep("bouc_wen", (self.scale, self.beta, self.gamma, self.exponent, self.origin))
 
     def shape_parameters(self) -> Shape:
         """Return beta, gamma and exponent with their bounds."""

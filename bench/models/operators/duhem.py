@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Shape
-from bench.models.operators.elements import CompiledStep, ElementOperator
+from bench.models.operators.elements import ElementOperator
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,3 @@ class Duhem(ElementOperator):
 
         x = self._x(np.append(inputs, present))
         return np.asarray(_element_kernels.duhem(x[:-1], float(x[-1]), self.rate, self.degree, elements))
-
-    def compiled_step(self) -> CompiledStep:
-        """Return the compiled step; see `ElementOperator.compiled_step`."""
-        return CompiledStep("duhem", (*self.input_range, self.rate))

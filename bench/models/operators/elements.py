@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,10 +13,6 @@ from numpy.typing import ArrayLike
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Operator
 from bench.models.regressor import Regressor
-from bench.models.streams.stream import Stream, address_of, compiled_step
-
-if TYPE_CHECKING:
-    from bench.models.operators.prandtl_ishlinskii import PrandtlIshlinskii
 
 ElementState: TypeAlias = tuple[float, ...]
 """The present input, then what each element remembers."""
@@ -24,15 +20,6 @@ ElementState: TypeAlias = tuple[float, ...]
 # Numbers of a block of columns, so that a long sequence does not need them all at once.
 # Derivation: eight MiB of float64, about what the last cache of a processor holds.
 _BLOCK = 2**20
-
-
-class CompiledStep(NamedTuple):
-    """What a stream of elements steps with."""
-
-    name: str  # the step
-    numbers: tuple[float, ...]  # the operator's numbers, in the order in which the step takes them
-    arrays: tuple[Floats, ...] = ()  # its arrays, likewise; at most four
-    module: str = "element_stream_kernels"  # of the step
 
 
 class ElementOperator(Operator[ElementState]):
@@ -106,15 +93,6 @@ class ElementOperator(Operator[ElementState]):
         row = self.respond(np.array([value], dtype=np.float64), state[0], elements)[0]
         return (float(value), *elements.tolist()), self.bias + float(row @ self._weights)
 
-    def compiled_step(self) -> CompiledStep | None:
-        """Return what streams step with; None if they step the operator itself."""
-        return None
-
-    def stream(self, state: ElementState | None = None) -> Stream[ElementState]:
-        """Return the operator with a memory of its own; see `Operator.stream`."""
-        start = self.initial_state() if state is None else state
-        return Stream(self, start) if self.compiled_step() is None else ElementStream(self, start)
-
     @cached_property
     def _size(self) -> int:
         return 1 + self.at_rest()[1].size
@@ -132,47 +110,3 @@ class ElementOperator(Operator[ElementState]):
         """Return the direction of the output, where the columns rise: None if the coefficients differ in sign."""
         values = self.coefficients
         return True if (values >= 0.0).all() else False if (values <= 0.0).all() else None
-
-
-class ElementStream(Stream[ElementState]):
-    """An operator of elements, changed in place; equal to `ElementOperator.step` but for the rounding of a sum.
-
-    The compiled step takes the address of the numbers, and returns nan where the input is not finite.
-    """
-
-    def __init__(self, operator: ElementOperator | PrandtlIshlinskii, state: ElementState) -> None:
-        from bench.models.kernels import element_stream_kernels as kernels
-
-        step = operator.compiled_step()
-        assert step is not None
-        self.operator = operator
-        self._step = compiled_step(step.name, step.module)
-        self._places = kernels
-        present, self._elements = operator._split(state)
-        self._numbers = np.zeros(kernels.NUMBER_COUNT)
-        self._numbers[: kernels.OWN] = present, operator.value(state), operator.bias
-        self._numbers[kernels.OWN : kernels.OWN + len(step.numbers)] = step.numbers
-        self._words = np.zeros(kernels.WORD_COUNT, dtype=np.int64)
-        # Kept for their addresses.
-        self._arrays = self._numbers, self._elements, operator.coefficients, *step.arrays
-        for place, array in enumerate(self._arrays):
-            self._words[place] = address_of(array)
-        self._words[kernels.COUNT] = self._elements.size
-        self._address = address_of(self._words)
-
-    def step(self, value: float) -> float:
-        """Move the input monotonically to `value` and return the output; see `Stream.step`."""
-        output = self._step(self._address, value)
-        if output != output and not math.isfinite(value):
-            raise ValueError(f"value: expected a finite number, got {value}")
-        return output
-
-    @property
-    def value(self) -> float:
-        """Present output, output units."""
-        return self._numbers.item(self._places.OUTPUT)
-
-    @property
-    def state(self) -> ElementState:
-        """Present input and elements, as a value."""
-        return (self._numbers.item(self._places.PRESENT), *self._elements.tolist())

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Shape
-from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState
+from bench.models.operators.elements import ElementOperator, ElementState
 
 if TYPE_CHECKING:
     from bench.models.inverses.branch_inverse import Branch
@@ -180,11 +180,6 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
 
         x = self._x(inputs)
         return np.asarray(_kernels.plays(self.rising(x), self.falling(x), self.thresholds, elements))
-
-    def compiled_step(self) -> CompiledStep:
-        """Return the compiled step; see `ElementOperator.compiled_step`."""
-        envelopes = (number for each in (self.rising, self.falling) for number in (*each, *each.ends()))
-        return CompiledStep("plays", (*self.input_range, *envelopes), (self.thresholds,))
 
     def saturated_state(self, direction: int, value: float | None = None) -> ElementState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.

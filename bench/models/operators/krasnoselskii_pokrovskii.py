@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState
+from bench.models.operators.elements import ElementOperator, ElementState
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +88,6 @@ class KrasnoselskiiPokrovskii(ElementOperator):
         from bench.models.kernels import element_kernels as _element_kernels
 
         return np.asarray(_element_kernels.ramps(inputs, *self._ramps, self.width, elements))
-
-    def compiled_step(self) -> CompiledStep:
-        """Return the compiled step; see `ElementOperator.compiled_step`."""
-        return CompiledStep("ramps", (self.width,), self._ramps)
 
     def saturated_state(self, direction: int, value: float | None = None) -> ElementState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from beyond the other end.

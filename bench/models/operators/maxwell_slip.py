@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState
+from bench.models.operators.elements import ElementOperator, ElementState
 
 if TYPE_CHECKING:
     from bench.models.inverses.branch_inverse import Branch
@@ -87,10 +87,6 @@ class MaxwellSlip(ElementOperator):
 
         columns = _element_kernels.stops(inputs, present, self.slips, elements)
         return np.column_stack([columns, inputs - self.origin])
-
-    def compiled_step(self) -> CompiledStep:
-        """Return the compiled step; see `ElementOperator.compiled_step`."""
-        return CompiledStep("stops", (self.origin,), (self.slips,))
 
     def saturated_state(self, direction: int, value: float | None = None) -> ElementState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from bench.base import Floats, checks as _checks
 from bench.models.documents import Parts
 from bench.models.operator import Operator
-from bench.models.operators.elements import CompiledStep, ElementStream
 from bench.models.regressor import Regressor
+from bench.models.streams.stream import PlayStream
 
 if TYPE_CHECKING:
     from bench.models.inverses.inverse import Inverse, Policy
@@ -282,19 +282,6 @@ class PrandtlIshlinskii(Operator[PlayState]):
         """
         return self._output(tuple(self._checked(state).tolist()))
 
-    def _split(self, state: PlayState) -> tuple[float, Floats]:
-        # The present input is that of the first play.
-        return self.origin, self._checked(state).copy()
-
-    def compiled_step(self) -> CompiledStep:
-        """Return the compiled step; see `ElementOperator.compiled_step`."""
-        maps = self.before, self.after
-        sizes = [-1 if zones is None else zones.thresholds.size for zones in maps]
-        lines = [np.empty(0) if zones is None else np.concatenate(zones.lines) for zones in maps]
-        return CompiledStep(
-            "step_plays", (self.origin, *sizes), (self.thresholds, self.weights, *lines), "play_stream_kernels"
-        )
-
     def stream(self, state: PlayState | None = None) -> PlayStream:
         """Return the operator with a memory of its own, compiled; see `Operator.stream`.
 
@@ -412,12 +399,3 @@ class PrandtlIshlinskii(Operator[PlayState]):
         slopes = [np.abs(zones.slopes).min() for zones in (self.before, self.after) if zones is not None]
         exact = min([*slopes, (self._sign * self._sums).min()]) > 0.0
         return PlayInverse(self) if exact else NumericalInverse(self, policy)
-
-
-class PlayStream(ElementStream):
-    """A Prandtl-Ishlinskii operator and its plays on arrays; equal to `evaluate` to the last bit."""
-
-    @property
-    def state(self) -> PlayState:
-        """Present play states, as a value."""
-        return tuple(self._elements.tolist())

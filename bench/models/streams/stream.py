@@ -19,6 +19,7 @@ from bench.models.memory import MemoryCurve, trusted_curve
 if TYPE_CHECKING:
     from bench.models.kernels.stream_kernels import Step
     from bench.models.operator import Operator
+    from bench.models.operators.prandtl_ishlinskii import PlayState, PrandtlIshlinskii
     from bench.models.operators.preisach import Preisach
 
 S = TypeVar("S")
@@ -157,6 +158,42 @@ class PreisachStream(Stream[MemoryCurve]):
         saturation: Literal[-1, 1] = -1 if self._words[kernels.SATURATION] < 0 else 1
         extrema = self._extrema[: self._words[kernels.EXTREMUM_COUNT]]
         return trusted_curve(tuple(extrema.tolist()), self._numbers.item(kernels.INPUT), saturation)
+
+
+class PlayStream(Stream["PlayState"]):
+    """A Prandtl-Ishlinskii operator and its plays on arrays; equal to its `evaluate` to the last bit."""
+
+    operator: PrandtlIshlinskii
+
+    def __init__(self, operator: PrandtlIshlinskii, state: PlayState) -> None:
+        self.operator = operator
+        self._step = compiled_step("step_plays", "play_stream_kernels")
+        maps = operator.before, operator.after
+        lines = [np.empty(0) if zones is None else np.concatenate(zones.lines) for zones in maps]
+        self._numbers = np.array([operator.value(state), operator.bias, operator.origin])
+        self._plays = np.array(state)
+        # Kept for their addresses.
+        self._arrays = self._numbers, self._plays, operator.thresholds, operator.weights, *lines
+        sizes = [self._plays.size, *(-1 if zones is None else zones.thresholds.size for zones in maps)]
+        self._words = np.array([*map(address_of, self._arrays), *sizes], dtype=np.int64)
+        self._address = address_of(self._words)
+
+    def step(self, value: float) -> float:
+        """Move the input monotonically to `value` and return the output; see `Stream.step`."""
+        output = self._step(self._address, value)
+        if output != output and not math.isfinite(value):
+            raise ValueError(f"value: expected a finite number, got {value}")
+        return output
+
+    @property
+    def value(self) -> float:
+        """Present output, output units."""
+        return float(self._numbers[0])
+
+    @property
+    def state(self) -> PlayState:
+        """Present play states, as a value."""
+        return tuple(self._plays.tolist())
 
 
 @cache
