@@ -2,10 +2,13 @@
 
 import math
 from contextlib import suppress
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import pytest
 
-from bench.base import DeviceConnectionError
+from bench.base import DeviceConnectionError, VirtualClock
 from bench.contracts import (
     ActuatorContract,
     ActuatorLineLostContract,
@@ -22,8 +25,10 @@ from bench.contracts import (
     WatchdogContract,
 )
 from bench.devices import Actuator
+from bench.rig import Rig, load_rig
 from sim_devices.protocol_emulated import register, unregister
 
+load_once = cache(load_rig)
 _CALLS = "measure", "glance", "set", "safe", "stop", "reconnect"
 
 
@@ -36,6 +41,15 @@ class Beside(OnEmulatedRig):
     within = 0.0
     other = None
     port_was_lost = False
+
+    @pytest.fixture
+    def rig(self):
+        """Connect the devices of one line of the rig."""
+        file = load_once(str(Path(__file__).parent / self.rig_file))
+        ports = {entry.name: entry.settings.port for entry in file.devices}
+        beside = tuple(entry for entry in file.devices if ports[entry.name] == ports[self.device_name])
+        with Rig(replace(file, devices=beside, interlocks=()), VirtualClock(), seed=0) as rig:
+            yield rig
 
     def lose_port(self):
         self.port_was_lost = True

@@ -11,6 +11,8 @@ from benches import seconds_until
 from bench.execution.guardian.rescuer import SILENCE, Report, is_needed
 from bench.rig import SAFE
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 
 class Signs:
     """What a guardian has written; `None` for a wait in which nothing has come, however long that took."""

@@ -16,12 +16,14 @@ from drivers.finding.places import answers, placements
 from drivers.finding.ports import Port, ports
 from sim_devices.serving.process import serve
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 DESK = Path(__file__).with_name("desk.toml")
 SHARED = Path(__file__).parents[3] / "examples" / "shared-line.toml"
 
 
 @pytest.fixture(scope="module")
-def desk():
+def desk(warm_popen):
     """Serve the desk; its rig file, and the served rig."""
     with serve(str(DESK), clock="x1") as rig:
         yield DESK, rig
