@@ -427,44 +427,6 @@ def test_sdk_reads_writes_and_is_refused(bus):
     assert servos[2].read_item(116) == 3000
 
 
-@pytest.mark.parametrize("how", ["txRxPacket", "fastSyncRead"])
-def test_sdk_sync_read(bus, how):
-    sdk, handler, port, _, _ = bus
-    group = sdk.GroupSyncRead(port, handler, 126, 21)
-    for number in (2, 3, 1):
-        assert group.addParam(number)
-    assert getattr(group, how)() == sdk.COMM_SUCCESS
-    for number in (1, 2, 3):
-        assert group.getData(number, 132, 4) == 1000 * number
-        assert group.getData(number, 144, 2) == 120
-        assert group.getData(number, 146, 1) == 25
-
-
-@pytest.mark.parametrize("how", ["txRxPacket", "fastBulkRead"])
-def test_sdk_bulk_read(bus, how):
-    sdk, handler, port, _, _ = bus
-    group = sdk.GroupBulkRead(port, handler)
-    assert group.addParam(3, 132, 4)
-    assert group.addParam(1, 146, 1)
-    assert getattr(group, how)() == sdk.COMM_SUCCESS
-    assert group.getData(3, 132, 4) == 3000
-    assert group.getData(1, 146, 1) == 25
-
-
-def test_sdk_sync_and_bulk_write(bus):
-    sdk, handler, port, servos, _ = bus
-    group = sdk.GroupSyncWrite(port, handler, 116, 4)
-    for number in (1, 2):
-        assert group.addParam(number, list((7 * number).to_bytes(4, "little")))
-    assert group.txPacket() == sdk.COMM_SUCCESS
-    bulk = sdk.GroupBulkWrite(port, handler)
-    assert bulk.addParam(3, 65, 1, [1])
-    assert bulk.addParam(1, 112, 4, [40, 0, 0, 0])
-    assert bulk.txPacket() == sdk.COMM_SUCCESS
-    assert [servos[number].read_item(116) for number in (1, 2)] == [7, 14]
-    assert (servos[3].read_item(65), servos[1].read_item(112)) == (1, 40)
-
-
 def test_sdk_reboot_clear_and_factory_reset(bus):
     sdk, handler, port, servos, clock = bus
     servos[1].trip(HardwareError.OVERLOAD)

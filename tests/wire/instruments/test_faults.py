@@ -1,6 +1,5 @@
 """Faults of lines, instruments, sensors and plants, in process on the virtual clock."""
 
-import json
 import math
 from functools import cache
 
@@ -433,20 +432,6 @@ def test_a_wrong_file_of_faults_is_one_message(tmp_path, name, text, words):
     (line,) = str(caught.value).splitlines()
     assert line.startswith(str(tmp_path / name))
     assert words in line
-
-
-def test_a_run_with_a_schedule_fails_at_its_instant_and_ends_safe(bench, tmp_path):
-    (tmp_path / "faults.toml").write_text("[[fault]]\nat = 12.5\nfault = 'tec-over-current'\n")
-    code, out, err = bench(
-        "run", "creep", "--rig", "vo2", "--clock", "virtual", "--set", "duration=20", "--out", tmp_path / "runs",
-        "--faults", tmp_path / "faults.toml", "--json", tmp_path / "result.json",
-    )  # fmt: skip
-    assert code == 4
-    assert "failed: " in out
-    assert "error: tec: " in err
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["is_safe"]
-    assert 12.5 < result["laboratory_seconds"] < 16.0
 
 
 @cache
