@@ -118,8 +118,9 @@ LINEAR = {
 }
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
-@pytest.mark.parametrize("kind", list(LINEAR))
+@pytest.mark.parametrize(
+    ("kind", "real"), [*((kind, "double") for kind in LINEAR), ("all", "float"), ("slow creep", "float")]
+)
 def test_responses_of_a_linear_part_are_those_of_python(kind, real, gcc, tmp_path):
     model, period = Hammerstein(FORCE, LINEAR[kind]), 0.01
     compiled = Compiled(ModelFile(kind, model), tmp_path, real, gcc, period=period)
