@@ -35,6 +35,9 @@ from warm_popen import WarmPopen
 # Modules of asserts that tests share.
 pytest.register_assert_rewrite("emulated_bench", "short_runs")
 
+# Until all tests are collected: most of what importing their modules makes stays.
+gc.disable()
+
 # Before numpy is loaded, and for the processes of the tests too: two workers, each with a thread of BLAS a core,
 # wait for one another, and a product of small matrices takes ten times as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -81,6 +84,11 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 50)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop():
+    gc.enable()
 
 
 @pytest.hookimpl(trylast=True)
