@@ -112,6 +112,8 @@ class TextLine(RepeatingLine):
                 "check power, cable, address, speed and terminators",
             )
         advice = form.doubt(answer, units) or "is it out of its range?"
+        if answer == question:
+            advice = f"{self._settings.port} hands back what is sent: set echo = true"
         raise DeviceError(self._device, f"answered {answer!r} to {question!r}, expected {form.text!r}; {advice}")
 
     def errors(self) -> list[str]:

@@ -61,7 +61,7 @@ class _Disturbance:
 
 
 DROP, CORRUPT, READDRESS, DOUBLE, DELAY = "drop", "corrupt", "readdress", "double", "delay"
-HALVE, GARBAGE, COMMA, SECOND_CLIENT = "halve", "garbage", "comma", "second-client"
+HALVE, GARBAGE, COMMA, SECOND_CLIENT, ECHO = "halve", "garbage", "comma", "second-client", "echo"
 
 _SUMMARIES = {
     DROP: "answers of {} are lost; it has acted all the same",
@@ -72,6 +72,7 @@ _SUMMARIES = {
     HALVE: "answers of {} come in two pieces",
     GARBAGE: "random bytes come before answers of {}",
     COMMA: "answers of {} have a comma in the place of each decimal point",
+    ECHO: "the adapter of {} hands back what is sent before the answer",
     SECOND_CLIENT: "another program uses the line of {}: an answer to it comes first, or in the place of one",
 }
 _MOST_GARBAGE = 8  # bytes
@@ -184,7 +185,7 @@ class FaultyLine:
         return found
 
     def _is_possible(self, kind: str) -> bool:
-        if kind in (GARBAGE, SECOND_CLIENT):
+        if kind in (GARBAGE, SECOND_CLIENT, ECHO):
             # TCP has a check of its own, and a connection for each client.
             return not isinstance(self._server, TcpServer)
         return {READDRESS: self._server.has_addresses, COMMA: self._server.is_text}.get(kind, True)
@@ -235,8 +236,8 @@ class FaultyLine:
             if ends and isinstance(stream, FaultyConnection):
                 stream.close()
 
-    def send(self, answer: bytes) -> list[tuple[float, bytes]]:
-        """Return what the client gets of an answer, each piece with the delay (s) after which it comes."""
+    def send(self, request: bytes, answer: bytes) -> list[tuple[float, bytes]]:
+        """Return what the client gets of the answer to a request: pieces, each with the delay (s) after which it comes."""
         if self.cable in _DEAD:
             return []
         begin = self._server.answer_begins(answer)
@@ -250,6 +251,8 @@ class FaultyLine:
         hit = [(kind, seconds) for kind in _SUMMARIES if (seconds := self._meets(kind)) is not None]
         kinds = dict(hit)
         self._former, self._last = self._last, answer
+        if ECHO in kinds:
+            sent.insert(0, (0.0, request))
         if DROP in kinds:
             return sent
         before = b""
@@ -353,7 +356,7 @@ class FaultyStream:
     def _send(self, request: bytes) -> None:
         answer = self._inner.receive(request)
         if answer:
-            for delay, piece in self._line.send(answer):
+            for delay, piece in self._line.send(request, answer):
                 self._put(delay, piece)
 
     def _put(self, delay: float, data: bytes) -> None:

@@ -43,11 +43,18 @@ def cell(rig, fault, seed=1):
         (SUPPLY, "meter.comma"),
         (PYMEASURE, "supply.cut"),
         ("sma", "load_cell.exchange"),
+        ("sma", "load_cell.echo"),
     ],
 )
 def test_a_run_with_a_fault_ends_safe_and_true(rig, fault):
     found = cell(rig, fault)
     assert not found.failures, found
+
+
+def test_an_adapter_that_hands_back_what_is_sent_is_named():
+    found = cell(SUPPLY, "supply.echo")
+    assert not found.failures, found
+    assert "echo = true" in found.reason
 
 
 def test_an_instrument_that_keeps_others_waiting_is_named():
