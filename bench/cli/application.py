@@ -57,6 +57,28 @@ class BenchCommands(Group):
         "rig": Command("Check, clear, calibrate and emulate instruments.", "groups:RigGroup", _EXTEND),
         "new": Command("Write the skeleton of a device, protocol, model, rig.", "part_commands:new", _EXTEND),
     }
+    former: ClassVar[Mapping[str, str]] = {
+        "repeat": "bench run --from RUN",
+        "campaign": "bench study FILE.toml",
+        "reproduce": "bench study NAME",
+        "recover": "bench rig clear",
+        "doctor": "bench rig check",
+        "calibrate": "bench rig calibrate",
+        "emulate": "bench rig emulate",
+        "shakedown": "bench rig check RIG --exercise",
+        "find": "bench rig find",
+        "torture": "bench rig torture",
+        "design": "bench model design",
+        "compare": "bench model test, and for two runs bench runs compare",
+        "twin": "bench model twin",
+        "tune": "bench model tune",
+        "export": "bench runs export",
+        "import": "bench runs import",
+        "recover-journal": "bench runs repair",
+        "watch": "bench view",
+        "replay": "bench view",
+        "identify-*": "bench identify RUN... --model NAME",
+    }
 
 
 app = typer.Typer(

@@ -73,16 +73,12 @@ NotifyOption = Annotated[
 
 def complete_rig(incomplete: str) -> list[str]:
     """Return the rigs whose names begin so, for the completion of a shell."""
-    from bench.rig import packaged_rigs
-
-    return [name for name in packaged_rigs([]) if name.startswith(incomplete)]
+    return _listed("rigs", incomplete)
 
 
 def complete_protocol(incomplete: str) -> list[str]:
     """Return the protocols whose names begin so, for the completion of a shell."""
-    from bench.protocol import packaged_protocols
-
-    return [name for name in packaged_protocols().protocols if name.startswith(incomplete)]
+    return _listed("protocols", incomplete)
 
 
 def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
@@ -96,6 +92,12 @@ def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
     except ConfigurationError:
         return []
     return [f"{name}=" for name in names if name.startswith(incomplete)]
+
+
+def _listed(kind: str, incomplete: str) -> list[str]:
+    from bench.cli.listing import listing
+
+    return [name for name in listing()[kind] if name.startswith(incomplete)]
 
 
 RigOption = Annotated[

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -26,17 +28,29 @@ class Command(NamedTuple):
 
 
 class _PlainParameters:
-    """A command whose help names no Python types."""
+    """A command whose help names no Python types, and which converts no value that was not given.
+
+    To convert any value typer imports pydantic, which takes as long as the rest of `bench list`.
+    """
 
     def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - the types of click are a private part of typer
         """Return arguments and options."""
         parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
         for each in parameters:
+            if "process_value" in vars(each):
+                continue
+            each.process_value = partial(_process_value, each, each.process_value)
             if each.param_type_name == "argument":
                 each.display_type = lambda _: ""
             elif each.metavar is None and not each.is_flag and not each.type_descriptor.is_choice:
                 each.metavar = "NUMBER" if each.type_descriptor.is_ranged else "TEXT"
         return parameters
+
+
+def _process_value(parameter: Any, convert: Callable[..., Any], ctx: Any, value: Any) -> Any:  # noqa: ANN401
+    if value is not None or parameter.required or parameter.nargs != 1 or getattr(parameter, "multiple", False):
+        return convert(ctx, value)
+    return None if parameter.callback is None else parameter.callback(ctx, parameter, None)
 
 
 class _OneCommand(_PlainParameters, TyperCommand):
@@ -56,12 +70,15 @@ class Group(_PlainParameters, TyperGroup):
         The command that takes the words if the first is no command; not shown. Empty if there is none.
     panel : str
         Heading of the commands that packages register.
+    former : mapping of str to str
+        Today's command by its former name, or a pattern of `fnmatch`.
     """
 
     own: ClassVar[Mapping[str, Command]] = {}
     others: ClassVar[str] = ""
     otherwise: ClassVar[str] = ""
     panel: ClassVar[str] = "Commands"
+    former: ClassVar[Mapping[str, str]] = {}
 
     def registered(self) -> dict[str, registry.RegisteredPart]:
         """Return what packages register in the group, by name."""
@@ -121,7 +138,10 @@ class Group(_PlainParameters, TyperGroup):
         return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401
-        """Return the command of the first word."""
+        """Return the command of the first word; say the present name if it is a former one."""
+        now = next((now for former, now in self.former.items() if fnmatchcase(args[0], former)), None)
+        if now is not None and args[0] not in self.registered():
+            raise ConfigurationError(f"bench {args[0]} is now {now}")
         if self.get_command(ctx, args[0]) is None and not ctx.resilient_parsing:
             known = closest(args[0], self.list_commands(ctx), f"`{ctx.command_path} --help`")
             raise ConfigurationError(f"{ctx.command_path}: there is no command {args[0]}; {known}")

@@ -11,6 +11,7 @@ from rich.padding import Padding
 
 from bench.base import ConfigurationError, closest, print_plain
 from bench.cli.command_support import JsonOption, write_json
+from bench.cli.listing import listing
 from bench.cli.printing import console, print_rows, warn
 from bench.cli.skeletons import Part
 
@@ -20,9 +21,7 @@ def list_(json_file: JsonOption = None) -> None:
 
     What comes from another package bears its name; an entry that cannot be loaded is named and left out.
     """
-    from bench.cli.catalogue import Catalogue
-
-    listed = Catalogue.of_installed().to_json()
+    listed = listing()
     _print_listing(listed)
     write_json(json_file, listed)
 

@@ -27,6 +27,8 @@ rate = -1
 # A command, and what its one line has to say: where, and the cure.
 MISTAKES = [
     ("rnu creep", ["no command rnu", "did you mean run?"]),
+    ("doctor vo2", ["bench doctor is now bench rig check"]),
+    ("identify-anything a b", ["is now bench identify RUN... --model NAME"]),
     ("rig chek vo2", ["no command chek", "did you mean check?"]),
     ("runs exprt", ["no exprt", "did you mean export?"]),
     ("study vo3", ["no vo3", "did you mean vo2?"]),
