@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from bench.base import (
@@ -56,9 +56,6 @@ class Bound:
     high: float
 
 
-_PLAIN_NUMBER = Display(1.0, "", 3)
-
-
 @dataclass(frozen=True)
 class Extremes:
     """The range that a signal went through.
@@ -78,8 +75,8 @@ class Extremes:
     low: float
     high: float
     unit: str
-    bounds: tuple[Bound, ...] = ()
-    display: Display = field(default=_PLAIN_NUMBER, compare=False)
+    bounds: tuple[Bound, ...]
+    display: Display
 
     @property
     def margin(self) -> float:
@@ -245,30 +242,6 @@ class Rehearsal:
             "marks": [[steps, round(seconds, 3)] for steps, seconds in self.marks],
             "shortened": list(self.shortened),
         }
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return one from the form of `to_json`."""
-        return cls(
-            **{key: content[key] for key in _PLAIN},
-            at_most=_or(content["at_most"], math.inf),
-            prompted=tuple(content["prompted"]),
-            extremes={
-                name: Extremes(
-                    each["low"],
-                    each["high"],
-                    each["unit"],
-                    tuple(
-                        Bound(bound["by"], _or(bound["low"], -math.inf), _or(bound["high"], math.inf))
-                        for bound in each["bounds"]
-                    ),
-                )
-                for name, each in content["extremes"].items()
-            },
-            findings=tuple(RehearsalFinding(**finding) for finding in content["findings"]),
-            marks=tuple((steps, seconds) for steps, seconds in content["marks"]),
-            shortened=tuple(content.get("shortened", ())),
-        )
 
 
 _PLAIN = ("rig", "protocol", "twin", "status", "reason", "complete", "steps", "seconds")
@@ -494,7 +467,3 @@ def _marks(finished: Sequence[float]) -> tuple[tuple[int, float], ...]:
 
 def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _or(value: float | None, other: float) -> float:
-    return other if value is None else value

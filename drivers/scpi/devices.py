@@ -60,10 +60,6 @@ class _MeasuringLine(TextLine, TableLine):
         if not settings.identity_query:
             return Identity("unknown", "text instrument", "unknown", "unknown")
         answer, _ = self.ask(settings.identity_query, template(ANY_TEXT))
-        if answer == settings.identity_query and not settings.echo:
-            raise DeviceConnectionError(
-                self._device, f"{settings.port} hands back what is sent; set echo = true, and check that it has power"
-            )
         return expected_identity(self._device, settings.port, answer, settings.identity)
 
     def start(self) -> None:

@@ -98,7 +98,7 @@ class TextLine(RepeatingLine):
                 continue
             answer = self._exchange(question)
             self.resends = 0 if answer is None else RESENDS
-            numbers = None if answer is None else form.match(answer, units)
+            numbers = None if answer in (None, question) else form.match(answer, units)
             if answer is not None and numbers is not None:
                 return answer, numbers
             self._in_step = False
@@ -111,9 +111,12 @@ class TextLine(RepeatingLine):
                 f"{1 + resends} request{'s' if resends else ''}{other_answer(self._transport.unfinished)}; "
                 "check power, cable, address, speed and terminators",
             )
-        advice = form.doubt(answer, units) or "is it out of its range?"
         if answer == question:
-            advice = f"{self._settings.port} hands back what is sent: set echo = true"
+            raise DeviceConnectionError(
+                self._device,
+                f"{self._settings.port} hands back what is sent; set echo = true, and check that it has power",
+            )
+        advice = form.doubt(answer, units) or "is it out of its range?"
         raise DeviceError(self._device, f"answered {answer!r} to {question!r}, expected {form.text!r}; {advice}")
 
     def errors(self) -> list[str]:

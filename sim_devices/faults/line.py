@@ -237,7 +237,7 @@ class FaultyLine:
                 stream.close()
 
     def send(self, request: bytes, answer: bytes) -> list[tuple[float, bytes]]:
-        """Return what the client gets of the answer to a request: pieces, each with the delay (s) after which it comes."""
+        """Return what the client gets of the answer to a request: pieces, each with its delay, s."""
         if self.cable in _DEAD:
             return []
         begin = self._server.answer_begins(answer)

@@ -117,7 +117,7 @@ class TestRehearsal:
         creep = find_protocol("creep")
         found = foresee(make(definition=creep, rig=rig, overrides=overrides), console)
         assert [*found.shortened] == [f"safety.reconnect = 10: the line of {each}" for each in shortened]
-        assert Rehearsal.from_json(found.to_json()).shortened == found.shortened
+        assert tuple(found.to_json()["shortened"]) == found.shortened
 
     def test_the_key_reconnect_that_is_cut_short_is_warned_of_in_the_record(self, make, console):
         run = make(
@@ -134,9 +134,10 @@ class TestRehearsal:
         assert [bound.by for bound in (*setpoint.bounds, *probe.bounds)] == ["device", "interlock"]
         assert probe.margin == 90.0 - probe.high
         assert rehearsal.extremes["tec_current"].margin == math.inf
-        again = Rehearsal.from_json(json.loads(json.dumps(rehearsal.to_json(), allow_nan=False)))
-        assert again == Rehearsal.from_json(rehearsal.to_json())
-        assert (again.steps, again.extremes) == (rehearsal.steps, rehearsal.extremes)
+        written = json.loads(json.dumps(rehearsal.to_json(), allow_nan=False))
+        assert written["steps"] == rehearsal.steps
+        assert written["extremes"]["tec_setpoint"]["margin"] == 30.0
+        assert written["extremes"]["tec_current"]["margin"] is None
 
     def test_a_reading_beyond_which_its_device_raises_is_a_bound(self, make, console):
         limits = {"devices.psd.position_limits": "[-40e-6, 95e-6]"}
@@ -210,8 +211,8 @@ class TestBeforeARun:
     def test_the_record_keeps_what_was_found(self, make, console):
         result = carry_out(make(settings={"dwell": 4.0}), console)
         with Record(result.folder) as record:
-            kept = Rehearsal.from_json(record.meta["rehearsal"])
-            assert (kept.steps, kept.seconds) == (4, record.meta["finished"])
+            kept = record.meta["rehearsal"]
+            assert (kept["steps"], kept["seconds"]) == (4, record.meta["finished"])
             card = run_card(record.meta)
         assert "| rehearsed on heater | 4 steps, 0:00:16, at most 0:00:16 |" in card
         assert "tec_setpoint 20 °C" in card

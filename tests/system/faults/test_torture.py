@@ -52,7 +52,7 @@ def test_a_run_with_a_fault_ends_safe_and_true(rig, fault):
 
 
 def test_an_adapter_that_hands_back_what_is_sent_is_named():
-    found = cell(SUPPLY, "supply.echo")
+    found = cell(SUPPLY, "supply.echo", 0)
     assert not found.failures, found
     assert "echo = true" in found.reason
 
