@@ -51,10 +51,12 @@ def test_a_run_with_a_fault_ends_safe_and_true(rig, fault):
     assert not found.failures, found
 
 
-def test_an_adapter_that_hands_back_what_is_sent_is_named():
-    found = cell(SUPPLY, "supply.echo", 0)
-    assert not found.failures, found
-    assert "echo = true" in found.reason
+def test_an_adapter_that_hands_back_what_is_sent_is_named(tmp_path):
+    schedule = tmp_path / "faults.toml"
+    schedule.write_text('[[fault]]\nat = 5.0\nfault = "supply.echo"\nduration = 100.0\n')
+    outcome = Bed.of(Task(SUPPLY, {})).run(0, tmp_path, schedule)
+    assert outcome.status == "failed"
+    assert "echo = true" in outcome.reason
 
 
 def test_an_instrument_that_keeps_others_waiting_is_named():
