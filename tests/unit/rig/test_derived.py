@@ -1,7 +1,6 @@
 """Derived signals: expressions with units, and classes of one's own beside the rig file."""
 
 import math
-import subprocess
 import sys
 from pathlib import Path
 
@@ -252,14 +251,13 @@ with Rig(load_rig(sys.argv[1]), VirtualClock(), 1) as rig:
 
 
 class TestOwnClass:
-    def test_beside_the_rig_file_without_a_search_path(self, rig_file, tmp_path):
+    def test_beside_the_rig_file_without_a_search_path(self, rig_file, tmp_path, warm_process):
         """Signals, drivers and laboratory are modules beside the rig file, and the process runs elsewhere."""
         (tmp_path / "own_signals_of_this_test.py").write_text(OWN_CLASS)
         (tmp_path / "heater_laboratory.py").write_text(Path(heater_laboratory.__file__).read_text("utf-8"), "utf-8")
         elsewhere = tmp_path / "elsewhere"
         elsewhere.mkdir()
-        command = [sys.executable, "-c", READ, rig_file(append=OWN)]
-        done = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=False)
+        done = warm_process([sys.executable, "-c", READ, rig_file(append=OWN)], elsewhere, None)
         assert done.returncode == 0, done.stderr
         assert "name='smaller', unit='°C', description='the smaller one'" in done.stdout
 

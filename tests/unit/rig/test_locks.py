@@ -203,17 +203,14 @@ class TestProcesses:
         (file,) = folder.iterdir()
         assert json.loads(file.read_text())["rig"] == "mine"
 
-    def test_one_of_many_that_ask_at_once_has_all_lines(self, tmp_path):
+    def test_one_of_many_that_ask_at_once_has_all_lines(self, tmp_path, warmly):
         ports = [port(tmp_path / name) for name in "abcde"]
         code = HOLDER.replace("child = ", "input(); sys.exit(print('has'))\nchild = ")
         # Each in an order of its own.
-        processes = [
-            subprocess.Popen(
-                [sys.executable, "-P", "-c", code, *ports[i:], *ports[:i]],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            )
-            for i in range(5)
-        ]  # fmt: skip
+        commands = [[sys.executable, "-P", "-c", code, *ports[i:], *ports[:i]] for i in range(5)]
+        ends = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        with warmly():
+            processes = [subprocess.Popen(command, text=True, **ends) for command in commands]
         refused = 0
         holders = list(processes)
         while len(holders) > 1:

@@ -374,3 +374,15 @@ def test_any_garbage_is_passed_over(garbage, pieces):
     server.receive(garbage[position:])
     assert server.receive(READ)[-15:-12] == READ_REPLY[:3]
     assert len(server._received) < LONGEST_FRAME
+
+
+def test_a_defect_of_the_instrument_is_a_device_failure(caplog):
+    cell = Cell()
+
+    def broken() -> float:
+        raise ZeroDivisionError
+
+    cell._force = broken
+    cell.clock.sleep(1.0)
+    assert ModbusRtuServer(cell).receive(READ) == sealed("01 83 04")
+    assert "the emulated instrument failed" in caplog.text
