@@ -131,12 +131,16 @@ class Run:
         return math.sqrt(0.5 * np.mean(self.errors[chosen] ** 2 + self.between[chosen] ** 2))
 
     def holds(self, reference, settling=5.0):
-        chosen = np.array([reference.holding(t, settling) for t in self.t])
+        chosen = self.rested(reference, settling) & (self.t > settling)
         return self.rms(chosen), np.abs(self.errors[chosen]).max()
 
     def moves(self, reference):
-        chosen = np.array([not reference.holding(t) for t in self.t]) & (self.t > 1.0)
+        chosen = ~self.rested(reference, 0.01) & (self.t > 1.0)
         return self.rms(chosen), np.abs(self.errors[chosen]).max()
+
+    def rested(self, reference, since):
+        """Return at which samples the reference stands where it stood a time (s) before."""
+        return np.array([reference(t) == reference(t - since) for t in self.t])
 
 
 def follow(controller, reference, duration, seed, room=None, **parameters):
