@@ -485,6 +485,15 @@ def test_safe_raises_only_after_everything_was_tried(script, servo):
     assert script.orders() == [(64, 0), (100, 0), "reboot"]
 
 
+def test_safe_of_a_silent_servo_tries_everything_and_does_not_take_long(script, servo, clock):
+    script.silent = True
+    begin = clock.now()
+    with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
+        servo.safe()
+    assert script.orders() == [(64, 0), (100, 0), "reboot"]
+    assert clock.now() - begin < 4.0
+
+
 def test_safe_succeeds_when_only_answers_were_lost(script, servo):
     servo.set(2.0)
     script.instead = [b"", b"", b"", None]

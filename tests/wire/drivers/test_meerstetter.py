@@ -561,6 +561,13 @@ def test_safe_raises_only_after_everything_was_tried(script, tec):
     assert [data[7:-5][:6] for data in script.received if data[7:8] != b"?"] == [b"VSC350", b"VS07DA", b"ES"]
 
 
+def test_safe_of_a_silent_device_tries_everything(script, tec):
+    script.silent = True
+    with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
+        tec.safe()
+    assert {data[7:-5][:6] for data in script.received} == {b"VSC350", b"VS07DA", b"ES"}
+
+
 def test_safe_succeeds_when_only_an_answer_was_lost(script, tec):
     tec.set(40.0)
     script.instead = [b"", None, b"", None]

@@ -646,6 +646,13 @@ def test_safe_over_another_line_needs_no_emergency_stop(script, supply):
     assert script.orders()[-1] == (0x200E, 0, 1)
 
 
+def test_safe_of_a_silent_device_tries_everything(script, supply):
+    script.silent = True
+    with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
+        supply.safe()
+    assert {data[1:3].hex() for _, data in script.received} == {"0020", "0e20", "0c20", "0221"}
+
+
 def test_safe_with_a_stale_heartbeat_or_a_fault_needs_no_emergency_stop(script, connect, clock):
     supply = connect(heartbeat=0.5)
     supply.set(6.0)
