@@ -95,7 +95,9 @@ class PatienceDisplay:
         """Take the bar away."""
         self._done.set()
         self._thread.join()
-        self._progress.stop()
+        # A bar that was not drawn would end with an empty line where the console is no terminal.
+        if self._progress.live.is_started:
+            self._progress.stop()
 
     def say(self, stage: str, share: float) -> None:
         """Show a stage of the work, and the share of it that is done, 0 to 1; a share never falls.

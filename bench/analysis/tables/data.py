@@ -288,7 +288,7 @@ def _reader(
         return partial(read_arrays, kind="MATLAB")
     if path.suffix.lower() == ".npz":
         return partial(read_arrays, kind="NumPy")
-    if path.suffix.lower() in _JSON:
+    if path.suffix.lower() in _JSON and start.lstrip()[:1] in (b"[", b"{"):
         return partial(read_arrays, kind="JSON")
     if start.startswith(_SPREADSHEETS):
         return read_spreadsheet

@@ -136,7 +136,7 @@ def test_what_does_not_fit_together_is_refused_with_the_option(bench, tmp_path):
     data, model = hammerstein(tmp_path), tmp_path / "model.json"
     without = COLUMNS[2:]
     nameless = tmp_path / "nameless.csv"
-    nameless.write_text(Path(data).read_text(encoding="utf-8").replace("time", "clock"), encoding="utf-8")
+    nameless.write_text(Path(data).read_text(encoding="utf-8").replace("time [ms]", "row"), encoding="utf-8")
     code, _, text = bench("identify", nameless, *without, "--model", "hammerstein")
     assert (code, "needs the time of each row: give --time COLUMN, or --format interval=TIME" in text) == (2, True)
     code, _, text = bench("identify", data, *without, "--time", "none", "--model", "hammerstein")
