@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import signal
@@ -22,7 +23,7 @@ from bench.base.errors import AbortError, BenchError
 from bench.base.interrupts import signal_name
 from bench.base.workers.display import TasksDisplay
 from bench.base.workers.messages import Progress, Result, Welcome, Words, receive, send
-from bench.base.workers.task import task_surroundings
+from bench.base.workers.task import COLLECTIONS, task_surroundings
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -139,6 +140,8 @@ class Workers:
                     self._stack.callback(signal.signal, getattr(signal, name), former)
         self._stack.enter_context(_one_thread())
         if self.in_process:
+            self._stack.callback(gc.set_threshold, *gc.get_threshold())
+            gc.set_threshold(*COLLECTIONS)
             self._stack.enter_context(task_surroundings(self._console, None))
         else:
             self._compile()

@@ -17,11 +17,7 @@ from typing import IO
 from bench.base.errors import BenchError
 from bench.base.printing import PlainConsole
 from bench.base.workers.messages import Message, Progress, Result, Welcome, Words, receive, send
-from bench.base.workers.task import task_surroundings
-
-_COLLECTIONS = 100_000, 20, 50
-"""Thresholds of the garbage collection, see `gc.set_threshold`. A task loads hundreds of thousands of objects that
-stay, and makes rows by the thousand that are no garbage: by Python's own, an export takes a quarter longer."""
+from bench.base.workers.task import COLLECTIONS, task_surroundings
 
 
 def main() -> None:
@@ -34,7 +30,7 @@ def main() -> None:
     except EOFError:
         return
     sys.argv = welcome.command
-    gc.set_threshold(*_COLLECTIONS)
+    gc.set_threshold(*COLLECTIONS)
     threading.Thread(target=_listen, args=(orders, inbox), name="orders", daemon=True).start()
     console = PlainConsole(file=_Speaker(outbox), width=welcome.width, force_terminal=False)
     with task_surroundings(console, lambda *how_far: outbox.put(Progress(*how_far))):
