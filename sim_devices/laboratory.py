@@ -248,7 +248,7 @@ class EmulatedLaboratory:
         """Bring the world to the present and return the time, s; within what is due, that is its instant."""
         if self.world is None:
             return self._clock.now()
-        self.world.advance()
+        self.world.catch_up()
         return self.world.time
 
     def _happen(self, each: ScheduledFault) -> None:

@@ -101,9 +101,8 @@ def check_tec(tec):
         within(f"parameter {number}", value, row.low, row.high)
         if not math.isfinite(value):
             raise FailedError(f"parameter {number}: {value}")
-    plate, _, current, _ = tec._load.terminals()
-    within("current", current, -4.0 - 1e-9, 4.0 + 1e-9)
-    within("plate temperature", plate, -273.15, 1000.0)
+    within("current", tec._load.current, -4.0 - 1e-9, 4.0 + 1e-9)
+    within("plate temperature", tec._load.plate_temperature, -273.15, 1000.0)
 
 
 def check_t7(t7):

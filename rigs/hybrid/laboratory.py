@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from bench.base import Clock
+from rigs.hybrid.scan import SensorScan
 from rigs.hybrid.witness import WitnessRegisters
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.faults.sensor import FaultySensor
@@ -28,7 +29,7 @@ from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.data_sheets import DISPLACEMENT, THERMISTOR
 from sim_devices.transducers.displacement import DisplacementSensor
-from sim_devices.transducers.imperfect import SensorErrors, imperfect, shown
+from sim_devices.transducers.imperfect import SensorErrors, characteristic_of, imperfect, shown
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.specimens import SensorSettings
 from sim_devices.transducers.thermistor import Thermistor
@@ -182,6 +183,18 @@ class HybridLaboratory(EmulatedLaboratory):
             self.amplifier.status,
         ]
         self.t7 = EmulatedT7(self.world, dict(enumerate(wires)), rng=t7)
+        characteristics = [characteristic_of(seen) for seen in self._shown.values()]
+        if None not in characteristics:
+            scan = SensorScan(
+                self.plant,
+                self.displacement,
+                self.base,
+                self.tip,
+                [each for each in characteristics if each is not None],
+                sensors,
+                lambda: self._stuck is None and not self._beyond,
+            )
+            self.t7.scan_by(scan)
         self.t7.add_follower(
             lambda: self.amplifier.drive(self.t7.tdac_volts(0), self.t7.dio_level(ENABLE_LINE, pulled_down=True))
         )

@@ -7,8 +7,7 @@ the deflection in m, a 64-bit floating-point number, highest word first.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 from pydantic import Field
@@ -18,7 +17,7 @@ from bench.devices import DriverSettings, Identity, PositionSensor
 from drivers.device import LineDevice
 from drivers.modbus import RefusedError, read_request
 from drivers.modbus_tcp import Connection, share
-from sim_devices.wire.modbus import ILLEGAL_ADDRESS, RegisterError
+from sim_devices.wire.modbus import ILLEGAL_ADDRESS, Frame, Packet, RegisterError
 from sim_devices.world import World
 
 _VALUE = struct.Struct(">d")
@@ -31,22 +30,26 @@ _REPLY = struct.Struct(">xBd")
 
 
 class WitnessRegisters:
-    """The registers of the witness; a `sim_devices.wire.modbus.RegisterBank`."""
+    """The registers of the witness; a `sim_devices.wire.modbus.PacketBank`."""
 
     def __init__(self, world: World, deflection: Callable[[], float]) -> None:
         self._world = world
         self._deflection = deflection
 
-    def request(self) -> AbstractContextManager[None]:
-        """Serve a request: hold the lock, at the clock's present time."""
-        return self._world.at_present()
-
     def read_registers(self, address: int, count: int) -> list[int]:
         """Return the words of the deflection; raise `RegisterError` for any other registers."""
         if (address, count) != _REGISTERS:
             raise RegisterError(ILLEGAL_ADDRESS, "the witness has the registers 0 to 3, to be read at once")
-        with self.request():
-            return list(_WORDS.unpack(_VALUE.pack(self._deflection())))
+        return list(_WORDS.unpack(self._read(b"")))
+
+    def prepare(self, frames: Sequence[Frame], heads: Sequence[int]) -> Packet | None:  # noqa: ARG002
+        """Return what carries such packets out: reads of the deflection."""
+        return self._read if list(frames) == [Frame(False, *_REGISTERS)] else None
+
+    def _read(self, packet: bytes) -> bytes:  # noqa: ARG002
+        with self._world.lock:
+            self._world.advance_locked()
+            return _VALUE.pack(self._deflection())
 
     def write_registers(self, address: int, values: list[int]) -> None:  # noqa: ARG002
         """Raise `RegisterError`: nothing can be written."""

@@ -8,6 +8,7 @@ muscle, a fan blows at it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -26,12 +27,12 @@ from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.instruments.roboteq_objects import Fault as SupplyFault
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
-from sim_devices.plants.grid import changed
+from sim_devices.plants.grid import GRID_TOLERANCE, Floats, changed
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import Muscle
 from sim_devices.plants.sma import SMAParameters, SMAWire
 from sim_devices.transducers.data_sheets import GAUGE_BLOCKS, LOAD_CELL, POSITION, WEIGHTS
-from sim_devices.transducers.imperfect import SensorErrors, imperfect, shown
+from sim_devices.transducers.imperfect import ImperfectSensor, SensorErrors, imperfect, shown
 from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.transducers.specimens import SensorSettings
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
@@ -66,7 +67,7 @@ FaultName = Literal[
 ]
 
 
-_SENSOR_KERNELS = ("sim_devices.transducers._imperfect_kernels",)
+_SENSOR_KERNELS = ("sim_devices.instruments._flintec_kernels", "sim_devices.transducers._imperfect_kernels")
 
 
 class MuscleLaboratorySettings(SensorSettings, ABC):
@@ -176,6 +177,11 @@ class Frame:
         """Take the load off and fasten the end to the stage, so that both stand at the same number of metres."""
         self._fastened = True
 
+    @property
+    def is_moving(self) -> bool:
+        """Whether the end follows a stage that is on its way."""
+        return self._fastened and self.drum is not None and self.drum.is_moving
+
     def advance(self, dt: float) -> None:
         """Integrate over `dt` seconds, with the end following the stage."""
         if self._fastened and self.drum is not None:
@@ -183,6 +189,53 @@ class Frame:
             reach = self.muscle.parameters.reach
             self.muscle.clamp(min(max(self.drum.position_after(dt), -reach), reach))
         self.muscle.advance(dt)
+
+
+class ForceCourse:
+    """The force of a muscle over time: a `sim_devices.instruments._flintec_kernels.Course`.
+
+    Parameters
+    ----------
+    frame : Frame
+        The muscle's frame.
+    muscle : Muscle
+        The muscle, which keeps its force.
+    sensor : FaultySensor
+        What the load cell sees of the force.
+    cell : callable
+        What the load cell makes of the force, without a fault.
+    """
+
+    tolerance = GRID_TOLERANCE
+
+    def __init__(self, frame: Frame, muscle: Muscle[Any], sensor: FaultySensor, cell: Callable[[], float]) -> None:
+        self._frame = frame
+        self._muscle = muscle
+        self._sensor = sensor
+        self._imperfect = cell if isinstance(cell, ImperfectSensor) else None
+        self.step = muscle.parameters.step
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it goes by what the muscle keeps: a stage on its way moves in pieces, from look to look."""
+        frame = self._frame
+        is_static = self._imperfect is None or self._imperfect.is_static
+        return is_static and not frame.is_broken and not frame.is_moving and self._sensor.is_whole
+
+    @property
+    def forces(self) -> Floats:
+        """What the load cell makes of the forces that the muscle keeps, N; see `Course.forces`."""
+        kept: Floats = self._muscle.forces
+        if self._imperfect is None:
+            return kept
+        shown = kept.copy()
+        # Behind the ring stands the number of the last one.
+        self._imperfect.characteristic.show(shown[:-1])
+        return shown
+
+    def since_point(self) -> float:
+        """Return the time for which the muscle has stood at the last grid point, s."""
+        return self._muscle.since_point()
 
 
 class MuscleLaboratory(EmulatedLaboratory):
@@ -248,6 +301,7 @@ class MuscleLaboratory(EmulatedLaboratory):
             weight_limits=(-5.0, 50.0),
             zero_tracking=0,
             noise=settings.force_noise,
+            course=ForceCourse(self.frame, self.muscle, self._force_sensor, self._force_shown),
         )
         self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)
         self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)

@@ -56,6 +56,7 @@ STUDY = Study(
         "bench.models.kernels.actuator_kernels",
         "bench.models.kernels.stream_kernels",
         "sim_devices.plants._friction_kernels",
+        "sim_devices.instruments._flintec_kernels",
         "sim_devices.transducers._imperfect_kernels",
     ),
 )

@@ -259,6 +259,7 @@ STUDY = Study(
         "bench.models.kernels.stream_kernels",
         "bench.models.kernels.actuator_kernels",
         "sim_devices.plants._sma_kernels",
+        "sim_devices.instruments._flintec_kernels",
         "sim_devices.transducers._imperfect_kernels",
     ),
 )

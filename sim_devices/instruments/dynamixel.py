@@ -235,7 +235,7 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
 
         The caller holds the lock of the world.
         """
-        self.world.advance()
+        self.world.advance_locked()
         if not self._reachable:
             return False
         self._attend_at(self._clock.now())

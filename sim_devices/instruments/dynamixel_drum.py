@@ -55,6 +55,11 @@ class EmulatedDrum(EmulatedDevice, LinearStage):
         """
         return self._metres(self._servo.position)
 
+    @property
+    def is_moving(self) -> bool:
+        """Whether the wire's end is on its way; asking does not let time pass."""
+        return self._servo.is_moving
+
     def position_after(self, seconds: float) -> float:
         """Return where the profile brings the wire's end within some seconds, m, for a plant on its way there."""
         return self._metres(self._servo.position_after(seconds))

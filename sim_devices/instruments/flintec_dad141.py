@@ -12,6 +12,7 @@ Assumptions, where these say nothing:
   in the same way, although it falls by 60 dB a decade. Filter mode 1 (FIR) is stored and changes nothing.
 - The noise of amplifier and cell is white before the filter.
 - Conversions are made on request, not 600 times a second; between two of them the force is interpolated linearly.
+  Those before a request are made together once it comes, where the plant keeps its course until then.
 - Integer weights are the displayed digits without the decimal point. The ADC value is the filtered signal with
   24 bits.
 - The range bits say that the gross weight is beyond the largest or the smallest value to be displayed; the
@@ -34,19 +35,25 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import attrgetter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.base import DeviceError
+from bench.base import DeferredModule, DeviceError
 from bench.devices import Identity, LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice, Pluggable
 from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
 from sim_devices.world import World
+
+if TYPE_CHECKING:
+    from sim_devices.instruments import _flintec_kernels as kernels
+else:
+    kernels = DeferredModule("sim_devices.instruments._flintec_kernels")
 
 CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.25)
 """3 dB cut-off by filter setting 0 to 8 (Technical Manual, 10.4.2, IIR filter)."""
@@ -76,8 +83,9 @@ _LAGS_CUTOFF = math.sqrt(math.sqrt(2.0) - 1.0)  # cut-off of two equal lags over
 _MEMORY_LAGS = 16.0  # time constants after which two lags have forgotten, to 2e-6
 _MOST_TRACKING = 255
 _FINE_LAGS = 0.5  # time constants between two looks at the force
-_COARSE = 0.05  # s between two looks for the motion detection
-_LEAST_LAGS = 1e-6  # time constants in which nothing changes
+_FEW_LOOKS = 4  # looks that are not put off
+_MOST_ASKED = 256  # readings whose conversions wait
+_NORMALS = 2048  # random numbers drawn at once
 _STILL_POLL = 0.05
 _STILL_TIMEOUT = 10.0
 _SET_UP_REGISTERS = frozenset((0x2106, 0x2110))
@@ -89,6 +97,13 @@ _TRACKING_BAND = 0.5  # d for each unit of ZT (10.2.8)
 _TRACKING_RATE = 0.4  # d in a second
 _TRACKING_LOOK = 0.1  # s
 _FIRST_ACCESS_CODE = 17
+# The state of the converter, in the order of the kernels, and where its digits stand there.
+_STATE = (
+    *("_converted", "_input", "_first", "_second", "_noise_first", "_noise_second", "_still_since"),
+    *("_reference", "_digits", "_gross", "_peak", "_zero"),
+)
+_DIGITS = slice(7, 11)
+_STATE_OF = attrgetter(*_STATE)
 
 
 def time_constant(setting: int) -> float:
@@ -103,21 +118,9 @@ def reading_interval(setting: int) -> float:
 
 @lru_cache(maxsize=256)
 def _fading(lags: float) -> tuple[float, float, float, float]:
-    """Return how the noise behind two lags fades within some time constants, exactly for white noise before them.
-
-    They are what remains of a lag's output; what of the two fresh numbers is added behind the second lag: of the one
-    that also goes into the first, and of the other; and what of the one behind the first.
-    """
-    # Kept, as the instrument mostly converts at even intervals.
-    decay = math.exp(-lags)
-    # The stationary covariance is 2, 1, 1 in units of the output's variance. What the known values still say of it
-    # fades by `known`; the rest is new.
-    known = decay * decay
-    first = -2 * math.expm1(-2 * lags)
-    both = 1 - known * (1 + 2 * lags)
-    second = 1 - known * (1 + 2 * lags + 2 * lags * lags)
-    along = both / math.sqrt(first)
-    return decay, along, math.sqrt(max(second - along * along, 0.0)), math.sqrt(first)
+    """Return `kernels.fading`; kept, as the instrument mostly converts at even intervals."""
+    found: tuple[float, float, float, float] = kernels.fading.py_func(lags)  # type: ignore[attr-defined]
+    return found
 
 
 @dataclass(frozen=True)
@@ -140,6 +143,8 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
     ----------
     force : callable
         The force on the cell in N, positive in tension, from the plant.
+    course : sim_devices.instruments._flintec_kernels.Course, optional
+        The same force over time: with it conversions wait until the instrument is asked.
     newtons_per_unit : float
         How the instrument was calibrated: N for each unit that it displays, not 0; 9.80665 for kg.
     zero_newtons : float
@@ -180,11 +185,16 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
         step: int = 1,
         zero_tracking: int = 1,
         noise: float = 5e-4,
+        course: kernels.Course | None = None,
         samples: int = 5,
         serial_number: int = 1410237,
         firmware: tuple[int, int] = (1, 10),
     ) -> None:
-        super().__init__(name, world, rng)
+        super().__init__(name, world)
+        self._rng = rng
+        self._block = np.empty(0)
+        """Normal random numbers, and how many of them are used."""
+        self._used = 0
         if not (math.isfinite(newtons_per_unit) and newtons_per_unit != 0):
             raise ValueError(f"newtons_per_unit: expected a number other than 0, got {newtons_per_unit}")
         if not 0 <= decimals <= 5:
@@ -200,11 +210,18 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
             raise ValueError(f"noise: expected zero or a positive number, got {noise}")
         if samples < 1:
             raise ValueError(f"samples: expected 1 or more, got {samples}")
+        self._now = world.clock.now
         self.serial_number = serial_number
         self.firmware = firmware
         self.frozen = False
         """A fault: the converter stands still, and with it everything that is read."""
         self._force = force
+        self._course = course
+        self._asked: list[float] = []
+        """Instants up to which conversions wait, s, and where the world stood before the first of them."""
+        self._asked_since = world.time
+        self._kept = 0.0 if course is None else (course.forces.size - 3) * course.step
+        """Time for which the course of the force is kept, s."""
         self._newtons_per_unit = newtons_per_unit
         self._zero_newtons = zero_newtons
         self._lowest, self._highest = low, high
@@ -222,7 +239,10 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
         self._written = True
         self.power_cycle()
         self._starts_at = -math.inf
-        world.add(self)
+        if course is not None:
+            # Compiled before a driver waits for an answer.
+            self._convert_along(course)
+        world.add(self, catch_up=self._catch_up)
 
     # The power supply.
 
@@ -260,14 +280,84 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
         """Return when the filter has to look at the force next, in laboratory seconds, if it is asked by now."""
         if self.frozen:
             return math.inf
+        now = self._now()
+        if self._course is not None and (self._asked or now - self._converted > self._near):
+            if self._may_wait(self._course, now):
+                return math.inf
+            if self._asked:
+                self._catch_up()
+                self._asked.clear()
         if self._tracking:
             return self._converted + _TRACKING_LOOK
-        now = self.world.clock.now()
-        waiting = now - self._converted
-        # The margins of one coarse step keep a clock that runs on from drawing these instants along with it.
-        if waiting <= _MEMORY_LAGS * self._lag + _COARSE:
+        if now - self._converted <= self._near:
+            # As a rule, and what the kernel says of it.
             return self._converted + self._fine
-        return now - self._memory if waiting > self._memory + _COARSE else self._converted + _COARSE
+        due: float = kernels.next_look.py_func(  # type: ignore[attr-defined]
+            self._converted, now, self._conversion
+        )
+        return due
+
+    def _may_wait(self, course: kernels.Course, now: float) -> bool:
+        """Return whether the conversions for a reading at the present can wait, and note that they do."""
+        asked = self._asked
+        # Zero tracking leaves the zero between two digits.
+        if self._tracking or not course.is_known or not self._zero.is_integer():
+            return False
+        if not asked:
+            if self._memory + kernels.COARSE > self._kept:
+                return False
+            # Before the plant goes on to the present.
+            self._asked_since = self.world.time
+        elif asked[-1] == now:
+            return True
+        elif len(asked) == _MOST_ASKED or now - max(self._converted, asked[0] - self._memory) > self._kept:
+            self._catch_up()
+            self._asked_since = self.world.time
+        asked.append(now)
+        return True
+
+    def _catch_up(self) -> None:
+        """Make the conversions that have waited, up to where the world stands."""
+        if self._asked and self._course is not None:
+            self._convert_along(self._course)
+
+    def _convert_along(self, course: kernels.Course) -> None:
+        until = self.world.time
+        state = np.array(_STATE_OF(self), dtype=np.float64)
+        point = until - course.since_point()
+        done = 0
+        while True:
+            more, self._asked_since, taken = kernels.convert_along(
+                state,
+                self._conversion,
+                np.array(self._asked[done:]),
+                self._asked_since,
+                until,
+                course.forces,
+                course.step,
+                point,
+                course.tolerance,
+                self._block[self._used :],
+            )
+            done += more
+            self._used += taken
+            if self._block.size - self._used >= 2:
+                break
+            self._draw_more()
+        del self._asked[:done]
+        values = state.tolist()
+        values[_DIGITS] = map(int, values[_DIGITS])
+        vars(self).update(zip(_STATE, values, strict=True))
+
+    def _draw_more(self) -> None:
+        self._block = np.concatenate((self._block[self._used :], self._rng.standard_normal(_NORMALS)))
+        self._used = 0
+
+    def _draw(self, deviation: float) -> float:
+        if self._used == self._block.size:
+            self._draw_more()
+        self._used += 1
+        return deviation * self._block.item(self._used - 1)
 
     def expire(self) -> None:
         """Look at the force."""
@@ -285,8 +375,22 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
         self._spread = self._noise * math.sqrt(time_constant(0) / self._lag)
         self._motion_time = set_up.motion_time / 1000
         # How long before a reading the force matters to it.
-        self._memory = _MEMORY_LAGS * self._lag + self._motion_time + 2 * _COARSE
+        self._memory = _MEMORY_LAGS * self._lag + self._motion_time + 2 * kernels.COARSE
         self._fine = _FINE_LAGS * self._lag
+        self._near = _FEW_LOOKS * self._fine
+        self._conversion = kernels.SetUp(
+            self._lag,
+            self._spread,
+            self._memory,
+            self._fine,
+            _MEMORY_LAGS * self._lag + kernels.COARSE,
+            float(set_up.motion_range),
+            self._span,
+            self._newtons_per_unit,
+            self._zero_newtons,
+            float(self._scale),
+            float(self._step),
+        )
 
     def _settle(self) -> None:
         """Begin with a filter that has settled, at this instant."""
@@ -305,7 +409,7 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
         now = self.world.time
         elapsed = now - self._converted
         lags = elapsed / self._lag
-        if self.frozen or lags < _LEAST_LAGS:
+        if self.frozen or lags < kernels.LEAST_LAGS:
             return
         decay, along, across, alone = _fading(lags)
         # Two equal lags with an input that runs straight from the last look to this one.
@@ -396,14 +500,20 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
         super().write_registers(address, values)
         self._written = True
 
-    @contextmanager
-    def request(self) -> Iterator[None]:
-        """Serve a request: hold the lock, with a conversion at the clock's present time."""
-        with self.world.lock:
-            self.world.advance()
+    def _begin(self) -> None:
+        self.world.lock.acquire()
+        try:
+            self.world.advance_locked()
+            if self._asked:
+                self._catch_up()
             self._convert()
             self._written = False
-            yield
+        except BaseException:
+            self.world.lock.release()
+            raise
+
+    def _end(self, error: BaseException | None) -> None:  # noqa: ARG002
+        self.world.lock.release()
 
     def _check_write(self, register: Register, whole: bool) -> None:
         # Here a register that can only be read is refused as such, also where half of it is written.
@@ -559,7 +669,7 @@ class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
         """Do nothing: a load cell is safe in any state."""
 
     def _reading(self) -> float:
-        with self.request():
+        with self._request():
             if self._qualifier & (UNDER_RANGE | OVER_RANGE):
                 side = "over" if self._qualifier & OVER_RANGE else "under"
                 raise DeviceError(self.name, f"is {side} its range: the weight is {self._gross / self._scale}")

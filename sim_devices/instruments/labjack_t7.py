@@ -30,19 +30,19 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.devices import Identity
 from sim_devices.instruments.emulated import Pluggable
-from sim_devices.instruments.registers import Register, RegisterInstrument
+from sim_devices.instruments.registers import FrameParts, Register, RegisterInstrument
 from sim_devices.noise import normals
-from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
+from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, Packet, RegisterError
 from sim_devices.world import World
 
 CHANNELS = 14
@@ -156,6 +156,29 @@ _SCALES = {(volts, index): _scale(volts, index) for volts in RANGES for index in
 """By range and resolution index."""
 
 
+class Scan(Protocol):
+    """The wires at the first inputs, with the conversion of each, in one call."""
+
+    count: int
+    """How many inputs."""
+
+    def __call__(self, scales: NDArray[np.float64], draw: Callable[[], float]) -> Sequence[float] | None:
+        """Return a reading (V) of each input, as conversions one after the other give it.
+
+        Parameters
+        ----------
+        scales : numpy.ndarray, shape (14, 4)
+            What a reading of each input is made of: noise, step, lowest and highest, V.
+        draw : callable
+            Returns the next number of the standard normal distribution, one a conversion.
+
+        Returns
+        -------
+        sequence of float or None
+            None, and nothing drawn, if the inputs have to be converted one by one.
+        """
+
+
 def _ground() -> float:
     return 0.0
 
@@ -201,10 +224,6 @@ class EmulatedT7(Pluggable, RegisterInstrument):
         If an input does not exist.
     """
 
-    _touched = False
-    """Whether an output may have changed since `_lead`."""
-    _is_serving = False
-
     def __init__(
         self,
         world: World,
@@ -223,18 +242,22 @@ class EmulatedT7(Pluggable, RegisterInstrument):
         self._sources = {channel: inputs.get(channel, _ground) for channel in range(CHANNELS)}
         self._draw = normals(rng).__next__
         self._held: dict[int, float] | None = None
+        self._scan: Scan | None = None
+        self._scales = np.zeros((CHANNELS, len(_Scale._fields)))
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None
         self._followers: list[Callable[[], None]] = []
         self._restart_followers: list[Callable[[], None]] = []
         self.flash_writes = 0
-        world.add(self)
+        self._announce = world.add(self, announces=True)
         self._start()
         self._set_map_up(self._register_map())
 
     def _start(self) -> None:
         """Set everything up that is not kept in the flash memory."""
         self._inputs = [_Input() for _ in range(CHANNELS)]
+        self._scales[:] = [settings.scale for settings in self._inputs]
+        self._are_single_ended = True
         self._stream_index = 0
         self._stream_settling = 0.0
         self._dacs = [0.0, 0.0]
@@ -246,6 +269,7 @@ class EmulatedT7(Pluggable, RegisterInstrument):
         self._user_ram = [0.0] * _USER_RAM
         self._expired_at = None
         self._due = self.world.time + self._watchdog.timeout if self._watchdog.enabled else math.inf
+        self._announce(self._due)
 
     def power_cycle(self) -> None:
         """Switch the instrument off and on: what is in its RAM is lost, what is in its flash memory stays.
@@ -267,6 +291,10 @@ class EmulatedT7(Pluggable, RegisterInstrument):
     def thaw(self) -> None:
         """Undo `freeze`."""
         self._held = None
+
+    def scan_by(self, scan: Scan | None) -> None:
+        """Convert the first inputs in one call wherever a packet reads all of them first; None for one by one."""
+        self._scan = scan
 
     def on_restart(self, follow: Callable[[], None]) -> None:
         """Call `follow()` at each power cycle."""
@@ -312,38 +340,40 @@ class EmulatedT7(Pluggable, RegisterInstrument):
 
     # The requests.
 
-    @contextmanager
-    def request(self) -> Iterator[None]:
-        """Serve a request: time first, then the watchdog, which any communication feeds unless strict.
+    def _begin(self) -> None:
+        """Begin a request: time first, then the watchdog, which any communication feeds unless strict."""
+        world, dog = self.world, self._watchdog
+        world.lock.acquire()
+        try:
+            world.advance_locked()
+            if not dog.enabled:
+                return
+            if not dog.strict:
+                self._due = world.time + dog.timeout
+                if self._expired_at is not None:
+                    self._expired_at = None
+                    self._announce(self._due)
+            elif self._expired_at is not None:
+                # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
+                periods = math.floor((world.time - self._expired_at) / dog.timeout) + 1
+                self._due = self._expired_at + periods * dog.timeout
+                self._expired_at = None
+                self._announce(self._due)
+        except BaseException:
+            world.lock.release()
+            raise
 
-        An access within a packet of several is no communication of its own.
-        """
-        with self.world.lock:
-            is_part, self._is_serving = self._is_serving, True
-            try:
-                if not is_part:
-                    self.world.advance()
-                    self._attend_watchdog()
-                yield
-            except RegisterError as error:
-                self._last_error = error.detail if isinstance(error, _DetailedError) else 0
-                raise
-            finally:
-                self._is_serving = is_part
-                if self._touched:
-                    self._lead()
-
-    def _attend_watchdog(self) -> None:
-        dog = self._watchdog
-        if not dog.enabled:
+    def _end(self, error: BaseException | None) -> None:
+        if error is None and not self._touched:
+            self.world.lock.release()
             return
-        if not dog.strict:
-            self._due = self.world.time + dog.timeout
-        elif self._expired_at is not None:
-            # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
-            periods = math.floor((self.world.time - self._expired_at) / dog.timeout) + 1
-            self._due = self._expired_at + periods * dog.timeout
-        self._expired_at = None
+        try:
+            if isinstance(error, RegisterError):
+                self._last_error = error.detail if isinstance(error, _DetailedError) else 0
+            if self._touched:
+                self._lead()
+        finally:
+            self.world.lock.release()
 
     def _wait(self, microseconds: float) -> None:
         if microseconds > _LONGEST_WAIT:
@@ -381,6 +411,7 @@ class EmulatedT7(Pluggable, RegisterInstrument):
     def _feed(self) -> None:
         self._due = self.world.time + self._watchdog.timeout
         self._expired_at = None
+        self._announce(self._due)
 
     def _enable_watchdog(self, value: float) -> None:
         if value not in (0, 1):
@@ -404,7 +435,7 @@ class EmulatedT7(Pluggable, RegisterInstrument):
 
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
-        with self.request():
+        with self._request():
             return self._convert(channel)
 
     def burst(self, channel: int) -> Burst:
@@ -412,7 +443,7 @@ class EmulatedT7(Pluggable, RegisterInstrument):
 
         Raises `RegisterError` if the input is not set up for it, or the burst would take longer than 0.18 s.
         """
-        with self.request():
+        with self._request():
             settings = self._inputs[channel]
             if settings.feature != _EF_AVERAGE:
                 raise RegisterError(ILLEGAL_ADDRESS, f"AIN{channel}_EF_INDEX is not {_EF_AVERAGE}")
@@ -423,7 +454,7 @@ class EmulatedT7(Pluggable, RegisterInstrument):
             begin, scan_rate = world.time, settings.scan_rate
             readings = []
             scale = _SCALES[settings.range, self._stream_index or _DEFAULT_STREAM_INDEX]
-            sleep_until, advance, convert = world.clock.sleep_until, world.advance, self._convert
+            sleep_until, advance, convert = world.clock.sleep_until, world.advance_locked, self._convert
             for sample in range(1, settings.samples + 1):
                 sleep_until(begin + sample / scan_rate)
                 advance()
@@ -447,11 +478,43 @@ class EmulatedT7(Pluggable, RegisterInstrument):
             held[channel] = volts
         return volts
 
+    def _carrying_out(
+        self,
+        parts: Sequence[FrameParts],
+        unpack: Callable[[bytes], tuple[float, ...]],
+        pack: Callable[..., bytes],
+    ) -> Packet:
+        """Return what carries frames out; those that only read, and begin with a scan, have it in one call."""
+        scan, first, left = self._scan, 0, [] if self._scan is None else self._conversions(self._scan.count)
+        while left and first < len(parts) and left[: len(parts[first][0])] == list(parts[first][0]):
+            left = left[len(parts[first][0]) :]
+            first += 1
+        if scan is None or left or any(registers for _, registers in parts):
+            return super()._carrying_out(parts, unpack, pack)
+        one_by_one, lead = self._conversions(scan.count), self._lead
+        draw, scales = self._draw, self._scales
+
+        def read_scan(packet: bytes) -> bytes:  # noqa: ARG001
+            volts = scan(scales, draw) if self._held is None and self._are_single_ended else None
+            values = [read() for read in one_by_one] if volts is None else [*volts]
+            for readers, _ in parts[first:]:
+                for read in readers:
+                    values.append(read())
+                if self._touched:
+                    lead()
+            return pack(*values)
+
+        return read_scan
+
+    def _conversions(self, count: int) -> list[Callable[[], float]]:
+        """Return what converts the first inputs, for the register map."""
+        return [read for n in range(count) if (read := self._named[f"AIN{n}"].read) is not None]
+
     def _set_range(self, channel: int, value: float) -> None:
         wanted = value or RANGES[0]  # 0 stands for the default
         for each in RANGES:
             if math.isclose(wanted, each, rel_tol=1e-6):
-                self._inputs[channel].set_up(each, self._inputs[channel].resolution)
+                self._set_input_up(channel, each, self._inputs[channel].resolution)
                 return
         raise _DetailedError(ERROR_RANGE, f"AIN{channel}_RANGE: {value:g} is none of {RANGES}")
 
@@ -459,6 +522,7 @@ class EmulatedT7(Pluggable, RegisterInstrument):
         if value != SINGLE_ENDED and not (channel % 2 == 0 and value == channel + 1):
             raise _DetailedError(ERROR_NEGATIVE_CHANNEL, f"AIN{channel}_NEGATIVE_CH: {value:g} is not allowed")
         self._inputs[channel].negative = int(value)
+        self._are_single_ended = all(settings.negative == SINGLE_ENDED for settings in self._inputs)
 
     def _checked_resolution(self, value: float) -> int:
         if not 0 <= value <= len(CONVERSIONS):
@@ -471,7 +535,11 @@ class EmulatedT7(Pluggable, RegisterInstrument):
         return value
 
     def _set_index(self, channel: int, value: float) -> None:
-        self._inputs[channel].set_up(self._inputs[channel].range, self._checked_resolution(value))
+        self._set_input_up(channel, self._inputs[channel].range, self._checked_resolution(value))
+
+    def _set_input_up(self, channel: int, volts: float, resolution: int) -> None:
+        self._inputs[channel].set_up(volts, resolution)
+        self._scales[channel] = self._inputs[channel].scale
 
     def _set_settling(self, channel: int, value: float) -> None:
         self._inputs[channel].settling = self._checked_settling(value, _LONGEST_SETTLING)

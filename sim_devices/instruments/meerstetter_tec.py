@@ -167,7 +167,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         self._supervised_at = world.time
         self._last_object, self._last_sink = load.plate_temperature, load.sink_temperature
         self._started_at = self._in_window_since = self._saturated_since = math.nan
-        world.add(self)
+        self._announce = world.add(self, announces=True)
 
     # Parameters and commands.
 
@@ -189,11 +189,17 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
 
     def attend(self) -> None:
         """Come up to the clock's present time and feed the watchdog: a valid package has arrived."""
-        with self.world.at_present():
-            now = self.world.time
-            if now > self._supervised_at:
-                self._supervise(now)
-            self._feed(now)
+        with self.world.lock:
+            self.attend_locked()
+
+    def attend_locked(self) -> None:
+        """Do as `attend`; the caller holds the world's lock."""
+        world = self.world
+        world.advance_locked()
+        now = world.time
+        if now > self._supervised_at:
+            self._supervise(now)
+        self._feed(now)
 
     def read_parameter(self, number: int, instance: int = 1) -> float:
         """Return the value of a parameter, in the unit of the table, as one request would.
@@ -262,6 +268,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self.attend()
             self._shut_down()
             self._restart_due = self.world.time + RESET_DELAY
+            self._announce(self._restart_due)
 
     # Faults.
 
@@ -423,8 +430,10 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
 
     def _feed(self, now: float) -> None:
         watchdog, status = self._values[2060], self._status
-        is_watched = watchdog > 0.0 and (status is _RUN or status is _READY)
-        self._watchdog_due = now + watchdog if is_watched else math.inf
+        due = now + watchdog if watchdog > 0.0 and (status is _RUN or status is _READY) else math.inf
+        if due < self._watchdog_due:
+            self._announce(due)
+        self._watchdog_due = due
 
     def _trip(self, error_number: int, parameter: int = 0) -> None:
         if self._status not in (DeviceStatus.READY, DeviceStatus.RUN):
@@ -435,6 +444,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         if self._values[6310] > 0.0:
             # No sooner than a reset: otherwise a cause that stays would trip and restart it within one instant.
             self._recovery_due = self.world.time + max(self._values[6310], RESET_DELAY)
+            self._announce(self._recovery_due)
         self._apply()
 
     def _shut_down(self) -> None:
@@ -492,6 +502,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         self._status = _RUN
         if not was_on:
             self._supervision_due = now + SUPERVISION_INTERVAL
+            self._announce(self._supervision_due)
         self._supervise(now)
 
     def _supervise(self, now: float) -> None:

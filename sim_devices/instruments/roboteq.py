@@ -241,7 +241,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         """
         with self.world.lock:
             row = self.entry(index, sub)
-            self.world.advance()
+            self.world.advance_locked()
             if not row.readable:
                 raise RequestRefusedError(AbortCode.WRITE_ONLY)
             if row.kind == "text":
@@ -257,7 +257,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         """
         with self.world.lock:
             row = self.entry(index, sub)
-            self.world.advance()
+            self.world.advance_locked()
             if not row.writable:
                 raise RequestRefusedError(AbortCode.READ_ONLY)
             if index >= _FIRST_COMMAND:
@@ -343,7 +343,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             self._reported, self._report = pdos, self._report_of(pdos)
         report = self._report
         with self.world.lock:
-            self.world.advance()
+            self.world.advance_locked()
             values = [read(sub) for read, sub in report.sources]
         return report.frames, report.form.pack(*report.carried(values))
 

@@ -291,8 +291,10 @@ def next_drive(state: State, command: Floats, c: Coefficients) -> float:
 
 
 @kernel
-def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
-    """Advance the whole plant by one grid step for each element of `normals`.
+def advance_steps(normals: Floats, command: Floats, forces: Floats, parts: Parts) -> None:
+    """Advance the whole plant by one grid step for each element of `normals`, and keep the force (N) at each.
+
+    `forces` is a ring: that of the n-th step is in place n modulo its size, and behind the ring stands n.
 
     The mechanical command is carried out first, at the drive of the step before, and then the drive moves.
     """
@@ -305,3 +307,6 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
             load_to(command[LOAD], parts)
         state.offset = c.offset_decay * state.offset + c.offset_kick * normals[row]
         drive_to(next_drive(state, command, c), c.step, clamped, parts)
+        step = int(forces[-1]) + 1
+        forces[step % (forces.size - 1)] = state.force
+        forces[-1] = step

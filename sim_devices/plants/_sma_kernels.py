@@ -364,8 +364,10 @@ def heat_to(temperature: float, clamped: bool, parts: Parts) -> None:
 
 
 @kernel
-def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
-    """Advance the whole plant by one grid step for each element of `normals`.
+def advance_steps(normals: Floats, command: Floats, forces: Floats, parts: Parts) -> None:
+    """Advance the whole plant by one grid step for each element of `normals`, and keep the force (N) at each.
+
+    `forces` is a ring: that of the n-th step is in place n modulo its size, and behind the ring stands n.
 
     The mechanical command is carried out first, at the temperature of the step before, and then the
     wire is heated: this order of the two moves decides the memory when both change in one step.
@@ -387,3 +389,6 @@ def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
         steady = c[0].ambient + offset + rise
         warm = steady + (state[TEMPERATURE] - steady) * decay
         heat_to(warm, clamped, parts)
+        step = int(forces[-1]) + 1
+        forces[step % (forces.size - 1)] = state[STRESS] * c[0].area
+        forces[-1] = step

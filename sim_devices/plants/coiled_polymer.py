@@ -107,6 +107,7 @@ class CoiledPolymerMuscle(FrictionMuscle[CoiledPolymerParameters]):
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
         self._state["offset"] = offset
         self._drive(room + offset, clamped=False)
+        self._keep_first_force()
 
     @property
     def temperature(self) -> float:

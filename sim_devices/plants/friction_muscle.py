@@ -131,6 +131,7 @@ class FrictionMuscle(Muscle[F]):
             np.zeros(parameters.contact_count),
         )
         self._condition(parameters.pretension, cold, rated)
+        self._keep_first_force()
 
     @property
     def force(self) -> float:
@@ -151,7 +152,7 @@ class FrictionMuscle(Muscle[F]):
         return float(self._state["position"] * MILLIMETRE)
 
     def _take_steps(self, normals: Floats) -> None:
-        kernels.advance_steps(normals, self._command, self._parts)
+        kernels.advance_steps(normals, self._command, self.forces, self._parts)
 
     def _drive(self, drive: float, *, clamped: bool) -> None:
         """Move pressure or temperature so slowly that the Maxwell arm has no part in it."""

@@ -114,6 +114,10 @@ class GridPlant(ABC, Generic[P]):
         """The numbers of this plant."""
         return self._parameters
 
+    def since_point(self) -> float:
+        """Return the time for which it has stood at the last grid point, s."""
+        return self._pending
+
     def advance(self, dt: float) -> None:
         """Advance the plant in time.
 

@@ -233,6 +233,15 @@ class HybridCantilever(CooledPlant[HybridParameters]):
     def _fraction(self) -> float:
         return self._pending / self._step if self._ahead else 0.0
 
+    @property
+    def numbers(self) -> Floats:
+        """All its numbers, as `_hybrid_kernels` takes them; read them only."""
+        return self._numbers
+
+    def moment(self) -> tuple[float, float]:
+        """Return the fraction of the grid step under way, and the time since the voltage last changed, s."""
+        return self._pending / self._step if self._ahead else 0.0, self._elapsed
+
     def _temperature(self, node: int) -> float:
         rise: float = self._rise.item(node)
         if self._ahead:

@@ -23,6 +23,9 @@ MILLIMETRE = 1e-3
 VOLTAGE, FAN, CLAMPED, LOAD, PLACE = range(5)
 COMMAND_SIZE = 5
 
+_FORCES = 128
+"""Grid points of which the force is kept."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MuscleParameters(PlantParameters):
@@ -108,11 +111,18 @@ class Muscle(GridPlant[M]):
     once: first the load or the position is moved there, at the pressure or temperature of the step before, then
     the muscle is inflated or heated. So neither the number nor the size of the calls of `advance` changes the
     trajectory, the noise included. There is no sensor noise here and no protection either.
+
+    Attributes
+    ----------
+    forces : ndarray
+        The force (N) at the last grid points, in a ring: that of the n-th step is in place n modulo its size, and
+        behind the ring stands n.
     """
 
     def __init__(self, parameters: M, rng: np.random.Generator) -> None:
         super().__init__(parameters, rng)
         self._command = np.zeros(COMMAND_SIZE)
+        self.forces = np.zeros(_FORCES + 1)
 
     def apply(self, voltage: float) -> None:
         """Apply a voltage.
@@ -191,6 +201,10 @@ class Muscle(GridPlant[M]):
     @abstractmethod
     def position(self) -> float:
         """Position of the moving end, m from rest: the elongation of muscle, frame and load cell."""
+
+    def _keep_first_force(self) -> None:
+        """Keep the force with which time begins."""
+        self.forces[0] = self.force
 
     @property
     def voltage(self) -> float:

@@ -191,9 +191,10 @@ class SMAWire(Muscle[SMAParameters]):
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
         self._state[kernels.AMBIENT_OFFSET] = offset
         self._heat(parameters.ambient_temperature + offset, clamped=False)
+        self._keep_first_force()
 
     def _take_steps(self, normals: Floats) -> None:
-        kernels.advance_steps(normals, self._command, self._parts)
+        kernels.advance_steps(normals, self._command, self.forces, self._parts)
 
     @property
     def temperature(self) -> float:

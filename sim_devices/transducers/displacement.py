@@ -36,11 +36,12 @@ class DisplacementSensor:
     """Source of the noise."""
 
     def __post_init__(self) -> None:
-        self._draw: Callable[[], float] = normals(self.rng).__next__
+        self.draw: Callable[[], float] = normals(self.rng).__next__
+        """Gives the next number of the standard normal distribution, for the noise of a conversion."""
         # Compiled before a driver waits for an answer.
         kernels.displacement_volts(0.0, self.resolution, self.reach, self.volts_per_metre)
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""
-        noisy = self.displacement() + self.noise * self._draw()
+        noisy = self.displacement() + self.noise * self.draw()
         return float(kernels.displacement_volts(noisy, self.resolution, self.reach, self.volts_per_metre))

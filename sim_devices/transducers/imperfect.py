@@ -179,11 +179,17 @@ class Characteristic:
             found += (values - smooth) / self._gain
         return found
 
+    @property
+    def numbers(self) -> tuple[float, float, float, float, float, float, float, float]:
+        """What `_imperfect_kernels.shown` takes besides the quantity."""
+        return (
+            self._gain, self._offset, self._wave, self._scale, self._middle, self._phase, _WAVE, self._resolution
+        )  # fmt: skip
+
     def _replace(self, quantities: Floats, resolution: float) -> None:
         from sim_devices.transducers import _imperfect_kernels as kernels
 
-        numbers = self._gain, self._offset, self._wave, self._scale, self._middle, self._phase, _WAVE
-        kernels.show(quantities, *numbers, resolution)
+        kernels.show(quantities, *self.numbers[:-1], resolution)
 
 
 class ImperfectSensor:
@@ -200,6 +206,10 @@ class ImperfectSensor:
     world : World
         The laboratory's time, for lag and latency.
 
+    Attributes
+    ----------
+    characteristic : Characteristic
+        What it makes of a value that has stood for long.
     """
 
     def __init__(
@@ -207,7 +217,8 @@ class ImperfectSensor:
     ) -> None:
         self._late = _Late(quantity, errors.lag, errors.latency, world) if errors.lag or errors.latency else None
         self._quantity = quantity
-        self._value = Characteristic(errors, low, high).value
+        self.characteristic = Characteristic(errors, low, high)
+        self._value = self.characteristic.value
 
     def __call__(self) -> float:
         """Return what the sensor makes of the quantity at this instant, in its unit and without noise."""
@@ -217,12 +228,24 @@ class ImperfectSensor:
         """Return the same, and change nothing."""
         return self._value(self._quantity() if self._late is None else self._late.peek())
 
+    @property
+    def is_static(self) -> bool:
+        """Whether it has neither lag nor latency."""
+        return self._late is None
+
 
 def imperfect(
     quantity: Callable[[], float], errors: SensorErrors, low: float, high: float, world: World
 ) -> Callable[[], float]:
     """Return what a sensor makes of a quantity; see `ImperfectSensor`. An ideal one makes nothing of it."""
     return quantity if errors == SensorErrors() else ImperfectSensor(quantity, errors, low, high, world)
+
+
+def characteristic_of(sensor: Callable[[], float]) -> Characteristic | None:
+    """Return what a sensor without lag and latency makes of its quantity; None if it has either."""
+    if not isinstance(sensor, ImperfectSensor):
+        return Characteristic(SensorErrors(), -1.0, 1.0)
+    return sensor.characteristic if sensor.is_static else None
 
 
 def shown(sensor: Callable[[], float]) -> float:

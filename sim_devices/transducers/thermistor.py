@@ -48,12 +48,13 @@ class Thermistor:
 
     def __post_init__(self) -> None:
         self.excitation_volts += self.excitation_error * self.rng.standard_normal()
-        self._draw: Callable[[], float] = normals(self.rng).__next__
+        self.draw: Callable[[], float] = normals(self.rng).__next__
+        """Gives the next number of the standard normal distribution, for the noise of a conversion."""
         a, b, c = self.steinhart_hart
-        self._circuit = self.reference_ohms, a, c, (b / (3 * c)) ** 3
+        self.circuit = self.reference_ohms, a, c, (b / (3 * c)) ** 3
         """Reference resistor (Ω), A and C (1/K), and (B / 3C)³."""
         # Compiled before a driver waits for an answer.
-        kernels.divider_volts(25.0, self.excitation_volts, *self._circuit)
+        kernels.divider_volts(25.0, self.excitation_volts, *self.circuit)
 
     def divider(self) -> float:
         """Return the voltage in V at the input of the divider at this instant."""
@@ -61,8 +62,8 @@ class Thermistor:
             return 0.0
         if self.open:
             return self.excitation_volts
-        celsius = self.temperature() + self.noise * self._draw()
-        return float(kernels.divider_volts(celsius, self.excitation_volts, *self._circuit))
+        celsius = self.temperature() + self.noise * self.draw()
+        return float(kernels.divider_volts(celsius, self.excitation_volts, *self.circuit))
 
     def excitation(self) -> float:
         """Return the voltage in V of the excitation at this instant."""

@@ -112,7 +112,7 @@ class MeComServer(WireServer):
         number = int(body[1:3], 16)
         if number != device.address and number not in (_BROADCAST, _SILENT):
             return b""
-        device.attend()
+        device.attend_locked()
         head = b"!" + body[1:7]
         try:
             payload = body[7:]

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 ILLEGAL_FUNCTION = 1
 ILLEGAL_ADDRESS = 2
@@ -25,7 +24,10 @@ _MOST_READ = 125  # registers in one read, Application Protocol 6.3
 _MOST_WRITTEN = 123  # registers in one write, Application Protocol 6.12
 _REGISTERS = 0x10000
 _FUNCTIONS = frozenset((_READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE_MANY))
+READS = (_READ_HOLDING, _READ_INPUT)
+"""Functions that read registers."""
 _BODY = struct.Struct(">BHH")  # function, address, and value or number of registers
+_WRITE_HEAD = _BODY.size + 1  # and the number of bytes of the values
 _WORDS = tuple(struct.Struct(f">{number}H") for number in range(256))
 _FRAME = struct.Struct(">BHB")  # of function 76: kind, address, number of registers
 _FRAME_READ, _FRAME_WRITE = 0, 1
@@ -53,14 +55,36 @@ class RegisterError(Exception):
 class RegisterBank(Protocol):
     """An instrument as Modbus sees it: 16-bit registers at addresses 0 to 65535."""
 
-    def request(self) -> AbstractContextManager[None]:
-        """Serve all accesses within as one request."""
-
     def read_registers(self, address: int, count: int) -> list[int]:
         """Return `count` registers from `address` on, each 0 to 65535; raise `RegisterError` to refuse."""
 
     def write_registers(self, address: int, values: list[int]) -> None:
         """Write registers from `address` on, each 0 to 65535; raise `RegisterError` to refuse."""
+
+
+class Frame(NamedTuple):
+    """A frame of LabJack's function 76."""
+
+    writes: bool
+    """Whether it sets registers; it reads them otherwise."""
+    address: int
+    number: int
+    """How many registers, 1 to 255."""
+
+
+Packet = Callable[[bytes], bytes]
+"""Carries the frames of a packet out, with the values in it, and returns what the reads among them give."""
+
+
+@runtime_checkable
+class PacketBank(Protocol):
+    """A bank that can prepare for packets of the same frames with other values, as a fast loop sends them."""
+
+    def prepare(self, frames: Sequence[Frame], heads: Sequence[int]) -> Packet | None:
+        """Return what carries such packets out, with the result of frame by frame; None if it cannot.
+
+        `heads` are the numbers of bytes of a packet that stand before the values of each frame.
+        """
 
 
 OwnFunctions = Mapping[int, Callable[[RegisterBank, bytes], bytes]]
@@ -72,15 +96,71 @@ def answer(bank: RegisterBank, request: bytes, own: OwnFunctions = MappingProxyT
     function = request[0]
     try:
         if function in own:
-            with bank.request():
-                return request[:1] + own[function](bank, request[1:])
+            return request[:1] + own[function](bank, request[1:])
         return request[:1] + _carry_out(bank, function, request)
-    except RegisterError as error:
-        return bytes((function | 0x80, error.code))
+    except Exception as error:
+        return refusal(request, error)
+
+
+def refusal(request: bytes, error: Exception) -> bytes:
+    """Return the reply to a request that was not carried out."""
+    if isinstance(error, RegisterError):
+        return bytes((request[0] | 0x80, error.code))
     # An emulator's defect must not end the server; the client sees a device that has failed.
-    except Exception:
-        _log.exception("the emulated instrument failed on request %s", request.hex(" "))
-        return bytes((function | 0x80, DEVICE_FAILURE))
+    _log.error("the emulated instrument failed on request %s", request.hex(" "), exc_info=error)
+    return bytes((request[0] | 0x80, DEVICE_FAILURE))
+
+
+class Prepared(NamedTuple):
+    """What a request takes that comes again, with other values if it writes."""
+
+    size: int
+    """Bytes of the request."""
+    same: int
+    """How many bytes at its beginning are always the same."""
+    packet: Packet
+    """Carries it out; takes the bytes before the request too."""
+    head: bytes
+    """What stands before the values of the reply."""
+    answered: int
+    """Bytes of the reply."""
+
+
+def prepare(bank: RegisterBank, request: bytes, before: int) -> Prepared | None:
+    """Prepare for a request that comes again; None if it is not well formed, or the instrument cannot.
+
+    These are reads, writes of several registers, and packets of function 76 that only read. What carries the request
+    out takes `before` bytes in front of it.
+    """
+    if not isinstance(bank, PacketBank) or len(request) < _BODY.size:
+        return None
+    function, size = request[0], len(request)
+    if function == FEEDBACK:
+        frames = _frames(request[1:])
+        if frames is None or any(frame.writes for frame in frames):
+            return None
+        same, heads, head = size, [0] * len(frames), request[:1]
+    else:
+        _, address, number = _BODY.unpack_from(request)
+        frames = [Frame(function == _WRITE_MANY, address, number)]
+        if number == 0 or address + number > _REGISTERS:
+            return None
+        if function in READS and size == _BODY.size and number <= _MOST_READ:
+            same, heads, head = size, [0], bytes((function, 2 * number))
+        elif (
+            function == _WRITE_MANY
+            and number <= _MOST_WRITTEN
+            and size == _WRITE_HEAD + 2 * number
+            and request[5] == 2 * number
+        ):
+            same, heads, head = _WRITE_HEAD, [before + _WRITE_HEAD], request[: _BODY.size]
+        else:
+            return None
+    packet = bank.prepare(frames, heads)
+    if packet is None:
+        return None
+    answered = len(head) + sum(2 * frame.number for frame in frames if not frame.writes)
+    return Prepared(size, same, packet, head, answered)
 
 
 def _carry_out(bank: RegisterBank, function: int, request: bytes) -> bytes:
@@ -139,6 +219,54 @@ def feedback(bank: RegisterBank, body: bytes) -> bytes:
             bank.write_registers(address, list(words.unpack_from(body, position)))
             position += words.size
     return values
+
+
+class Feedback:
+    """Function 76 of one instrument, which prepares for the packets that come again and again.
+
+    A packet is known again by all its bytes but the values that it writes.
+    """
+
+    _MOST_KNOWN = 256
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[int, int, Packet]] = {}
+
+    def __call__(self, bank: RegisterBank, body: bytes) -> bytes:
+        """Carry a packet out; see `feedback`."""
+        known = self._known.get(len(body))
+        if known is not None:
+            mask, pattern, carry_out = known
+            if int.from_bytes(body) & mask == pattern:
+                return carry_out(body)
+        elif len(self._known) >= self._MOST_KNOWN:
+            self._known.clear()
+        if isinstance(bank, PacketBank) and (frames := _frames(body)) is not None:
+            packet = bank.prepare(frames, [_FRAME.size] * len(frames))
+            if packet is not None:
+                mask = int.from_bytes(
+                    b"".join(b"\xff" * _FRAME.size + bytes(2 * frame.number * frame.writes) for frame in frames)
+                )
+                self._known[len(body)] = mask, int.from_bytes(body) & mask, packet
+                return packet(body)
+        return feedback(bank, body)
+
+
+def _frames(body: bytes) -> list[Frame] | None:
+    """Return the frames of a packet that is well formed, and whose reply fits into a packet; None for another."""
+    frames: list[Frame] = []
+    position = answered = 0
+    while position + _FRAME.size <= len(body):
+        kind, address, number = _FRAME.unpack_from(body, position)
+        if kind not in (_FRAME_READ, _FRAME_WRITE) or number == 0 or address + number > _REGISTERS:
+            return None
+        frames.append(Frame(kind == _FRAME_WRITE, address, number))
+        position += _FRAME.size
+        if kind == _FRAME_WRITE:
+            position += 2 * number
+        else:
+            answered += 2 * number
+    return frames if frames and position == len(body) and answered <= _MOST_FEEDBACK else None
 
 
 def _check_range(address: int, count: int) -> None:

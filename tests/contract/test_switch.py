@@ -36,6 +36,9 @@ class RecordingT7(EmulatedT7):
         self.requests.append(("write", address, values))
         super().write_registers(address, values)
 
+    def prepare(self, frames: object, head: int) -> None:
+        """Each request is to be seen, also one that comes again."""
+
 
 @dataclass
 class Laboratory:

@@ -92,6 +92,32 @@ class TestDeadlines:
         at(world, 2.0)
         assert [entry[0] for entry in log] == ["a", "b", "c"]
 
+    def test_one_that_comes_closer_is_kept_where_it_is_announced(self, world):
+        log = []
+
+        class Announcing(Alarm):
+            asked = 0
+
+            def deadline(self):
+                self.asked += 1
+                return super().deadline()
+
+        announced = []
+        add, world.add = world.add, lambda timed: announced.append(add(timed, announces=True))
+        alarm = Announcing(world, log, "a", [8.0])
+        at(world, 1.0)
+        asked = alarm.asked
+        for tick in range(100):
+            at(world, 1.0 + 0.01 * tick)
+        assert alarm.asked == asked
+        alarm.times.insert(0, 3.0)
+        (announce,) = announced
+        announce(3.0)
+        at(world, 5.0)
+        assert [(name, due, time) for name, due, time, _ in log] == [("a", 3.0, 3.0)]
+        at(world, 9.0)
+        assert [due for _, due, *_ in log] == [3.0, 8.0]
+
     def test_a_deadline_of_the_past_happens_now(self, world):
         at(world, 10.0)
         log = []

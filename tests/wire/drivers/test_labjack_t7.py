@@ -153,7 +153,6 @@ class Altered:
     def __init__(self, instrument: EmulatedT7, alter: Callable[[int, list[int]], list[int]]) -> None:
         self._instrument = instrument
         self._alter = alter
-        self.request = instrument.request
 
     def read_registers(self, address: int, count: int) -> list[int]:
         return self._alter(address, self._instrument.read_registers(address, count))
