@@ -242,7 +242,7 @@ class _Modelled(MuscleController):
 
     def _take_in(self, t: float, measured_input: float, output: float, others: tuple[float, ...]) -> None:
         low, high = self._plausible_input
-        # A reading of 0 V may be less than that.
+        # Noise may make a reading of 0 V negative.
         applied = max(measured_input, 0.0) if low <= measured_input <= high else self._setpoint
         passed = 0.0 if self._time is None else t - self._time
         if passed < 0.0:

@@ -124,7 +124,7 @@ class Workers:
         self._changed = threading.Condition()
         self._tasks: list[Pending[Any]] = []
         self._waiting: deque[Pending[Any]] = deque()
-        # Each of its jobs carries out the task that is the first by then.
+        # A job carries out the task that is first in the queue when the job starts.
         self._threads = ThreadPoolExecutor(self.number, "worker")
         self._own = threading.local()
         self._processes: set[_Worker] = set()
@@ -190,7 +190,7 @@ class Workers:
         if not self.in_process:
             if getattr(function, "__module__", "") == "__main__":
                 raise TypeError(f"{name}: a worker process cannot import {function!r}; put it into a module")
-            # By itself, as a worker may be unable to read it.
+            # Pickled apart from its message: a worker may be unable to read it.
             task._order = pickle.dumps(task._call)
         with self._changed:
             self._tasks.append(task)
@@ -225,7 +225,7 @@ class Workers:
             task.set_exception(error)
 
     def _carry_out_first(self) -> None:
-        """Have the first task that waits carried out by the worker process of this thread; by another if it dies."""
+        """Have the worker process of this thread carry out the first task that waits; another one if it dies."""
         with self._changed:
             task = self._waiting.popleft()
         line = self._display.begin(task.name)
@@ -343,7 +343,7 @@ class _Worker(subprocess.Popen[bytes]):
     def carry_out(
         self, order: bytes, advance: Callable[[int, int | None, str], None], say: Callable[[str], None]
     ) -> Result:
-        """Return the result of a task; hand on how far it is and what it says before.
+        """Return the result of a task; until then, hand on how far it is and what it says.
 
         Raises EOFError or OSError if the process is gone.
         """
