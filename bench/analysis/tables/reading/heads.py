@@ -184,9 +184,9 @@ def with_times(
 ) -> list[str]:
     """Return names of columns, and that of the column of times if `times` asks for it and there is one.
 
-    It is the first of `times` that `find` finds. Otherwise it is the first column with a name of times, then the first
-    with a unit of time, then the first with dates and times, which `moments` lists. A column with another unit holds
-    no times.
+    It is the first of `times` that `find` finds. Otherwise it is the first column with a name of times, then the
+    first with a unit of time, then the first with dates and times, which `moments` lists. A column with another unit
+    holds no times.
     """
     units = ["" if place in moments else head.unit for place, head in enumerate(heads)]
     may_be = [unit in ("", *SECONDS) for unit in units]
