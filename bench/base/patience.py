@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from threading import Event, Thread
 from typing import TypeAlias
 
 from rich.console import Console
+from rich.errors import LiveError
 
 from bench.base.printing import print_plain
 
@@ -118,7 +119,9 @@ class PatienceDisplay:
         if self._done.wait(self._patience):
             return
         if self._console.is_terminal:
-            self._progress.start()
+            # Rich draws one display beside another only from version 14.1 on.
+            with suppress(LiveError):
+                self._progress.start()
         else:
             print_plain(self._console, f"{self._text} …")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -31,8 +31,14 @@ _SPREADSHEETS = b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 
 _JSON = ".json", ".jsonl", ".ndjson"
 
+TIME_LEFT_OUT = "{}: time is left out"
+"""What is said of times that nobody asked for and that cannot be used."""
+
 _LIST = re.compile(r",(?![^(\[]*[)\]])")
 """Between names of columns, of which one may be `A(:,1)`."""
+
+Reader: TypeAlias = Callable[[Path, Sequence[str], ReadingOptions, Sequence[str]], ReadColumns]
+"""Reads columns of a file, and the column of times if it is asked for."""
 
 _STEPS, _TELEMETRY = "steps", "telemetry"
 
@@ -145,7 +151,8 @@ def read_columns(
                 raise
             # Of a file that can be read without times their column is at fault.
             found = read_columns(path, names, at_least=at_least, options=options, table=table)
-            return replace(found, assumptions=f"{found.assumptions}, time is left out: {error}")
+            notes = filter(None, [found.assumptions, TIME_LEFT_OUT.format(error)])
+            return replace(found, assumptions=", ".join(notes))
     _check_rows(path, len(next(iter(columns.values.values()))), at_least)
     for name, values in columns.values.items():
         beyond = np.flatnonzero(np.abs(values) >= _OVERLOAD)
@@ -273,12 +280,8 @@ def _as_text(cell: object) -> object:
     return cell
 
 
-def _reader(
-    path: Path, table: Mapping[str, Any] | None
-) -> Callable[[Path, Sequence[str], ReadingOptions, Sequence[str]], ReadColumns]:
-    """Return what reads a kind of file, by its first bytes, or a table in memory."""
-    if table is not None:
-        return partial(read_arrays, kind="table", table=table)
+def _reader(path: Path) -> Reader:
+    """Return what reads a kind of file, by its first bytes."""
     if path.exists() and not path.is_file():
         raise DataError(f"{path} is a pipe or a device, and a table is read more than once: save it to a file first")
     with reading_errors(path), path.open("rb") as file:
@@ -315,7 +318,8 @@ def _from_files(
         own = [elsewhere[name][1] if name in elsewhere else name for name in asked]
         if not asked:
             continue
-        found = _joined(file, own, options, times if file == path else (), table if file == path else None)
+        in_memory = None if table is None or file != path else partial(read_arrays, kind="table", table=table)
+        found = _joined(in_memory or _reader(file), file, own, options, times if file == path else ())
         for name, column, unit in zip([*asked, *found.names[len(own) :]], found.values, found.units, strict=True):
             values[name], units[name] = column, unit
         time = (*found.names[len(own) :], time)[0]
@@ -343,14 +347,9 @@ def find_elsewhere(path: Path, name: str) -> tuple[Path, str] | None:
 
 
 def _joined(
-    path: Path,
-    names: Sequence[str],
-    options: ReadingOptions,
-    times: Sequence[str],
-    table: Mapping[str, Any] | None,
+    reader: Reader, path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str]
 ) -> ReadColumns:
     """Read columns of a file; where it has none of the name of a list, its members are joined in order."""
-    reader = _reader(path, table)
     try:
         return reader(path, names, options, times)
     except NoColumnError:

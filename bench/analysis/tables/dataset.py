@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.data import Quantity, check_variation, is_run, read_columns
+from bench.analysis.tables.data import TIME_LEFT_OUT, Quantity, check_variation, is_run, read_columns
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.times import rows_in_time, seconds_of
@@ -133,7 +133,7 @@ class Dataset:
         try:
             _ = self.times
         except DataError as error:
-            return self.without_time(f"{error}: time is left out")
+            return self.without_time(TIME_LEFT_OUT.format(error))
         return self
 
     def check_units(self, model: ModelFile) -> None:

@@ -135,7 +135,7 @@ def _read_table(
     ending: Ending | None = None,
 ) -> ReadColumns:
     """Read columns of a table; _SeveralError if its end is unknown and other tables follow."""
-    row = next(split_rows(lines[layout.start - options.skip_lines :], layout.delimiter), None)
+    row = next(split_rows(lines[layout.start - options.skip_lines :], layout.delimiter), None) if times else None
     moments = with_moments(row.cells, range(len(layout.heads))) if row is not None else ()
     names = with_times(names, times, layout.heads, lambda name: _place(file, layout, name), moments)
     layout, places = _find_places(file, names, options, layout, lines)
