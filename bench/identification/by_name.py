@@ -57,11 +57,11 @@ class Candidate:
     smoothing, ridge : float or None
         Weights of the penalties; None leaves them to the fit of a density of either sign.
     dynamics : str
-        What follows the operator in time, as `identify_hammerstein` takes it; empty for the operator alone.
+        Dynamic elements behind the operator, as `identify_hammerstein` takes them; empty for the operator alone.
     shape : tuple of float
         Shape parameters of the operator; empty if they are to be found.
     parameters : mapping of str to float
-        Nonlinear parameters of what follows the operator from which their search starts; others have several starts.
+        Nonlinear parameters of these elements, from which their search starts; others have several starts.
     """
 
     model: str

@@ -9,7 +9,7 @@ from typing import IO, Any
 
 @dataclass(frozen=True)
 class Welcome:
-    """What a worker process has to know: command line, and width of the terminal. A task is `bytes`: its call."""
+    """Command line and width of the terminal, for a worker process. Its tasks follow as `bytes`: pickled calls."""
 
     command: list[str]
     width: int

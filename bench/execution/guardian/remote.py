@@ -66,7 +66,7 @@ class RemoteStation(Station):
     seed : int
         Seed of everything random in an emulated laboratory.
     doing : str
-        What it is opened for, in a few words, for who finds the rig in use.
+        Purpose in a few words, shown to whoever finds the rig in use.
 
     Raises
     ------

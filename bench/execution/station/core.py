@@ -31,7 +31,7 @@ class StationCore:
     over : bool
         Whether it is in its safe state for good.
     cause : BenchError or None
-        What tripped it; None if it has not tripped, or the bench asked for the end.
+        Error that tripped the station; None before that, or if the bench asked for the end.
     late : bool
         Whether that was a promise of the bench.
     holding : bool

@@ -112,7 +112,7 @@ def identify_hammerstein(
     moments, sequence, measured = check_sequence(times, inputs=inputs, outputs=outputs)
     chosen = None if dynamics is None else _elements(dynamics)
     tried = [float(weight) for weight in np.atleast_1d(np.asarray(smoothing, dtype=np.float64))]
-    # What follows the operator hardly depends on the weight; without any a fine plane takes it for hysteresis.
+    # The dynamic elements hardly depend on the penalty, but without one a fine plane takes them for hysteresis.
     settings = Candidate(static, options, orientation, initial, tried[len(tried) // 2], ridge)
     search = set_up_search(settings, moments, sequence, measured, weights, skip)
     advice = list(search.static.advice())
@@ -191,7 +191,7 @@ def set_up_search(
     weights: ArrayLike | None = None,
     skip: int = 0,
 ) -> Search:
-    """Return the search for what follows an operator, whose settings these are; see `identify_hammerstein`."""
+    """Return the search for the dynamic elements behind an operator with its settings; see `identify_hammerstein`."""
     static, smoothing, ridge = settings.model, settings.smoothing or 0.0, settings.ridge or 0.0
     if static == "preisach":
         settings = replace(settings, options={"reversible": "linear", **settings.options})

@@ -97,8 +97,7 @@ class SeenInput:
     response : ResponseDynamics
         With the lag; without one the input is seen at once.
     start : float
-        What is seen until the first reading, input units; nan for the input that is read there, as of an actuator at
-        rest.
+        Input that is seen until the first reading, input units; nan if the actuator rests at the first reading.
     """
 
     def __init__(self, response: ResponseDynamics, start: float = math.nan) -> None:
@@ -119,12 +118,12 @@ class SeenInput:
         return self.value
 
     def lead(self, target: float, horizon: float, limits: tuple[float, float]) -> float:
-        """Return the constant input that leads to what is to be seen within a time, as far as the limits allow.
+        """Return the constant input after which a target is seen within a time, as far as the limits allow.
 
         Parameters
         ----------
         target : float
-            What is to be seen at the end, input units.
+            Input to be seen at the end of the horizon, input units.
         horizon : float
             Time until then, s, > 0; the input exceeds its steady value the more, the shorter it is.
         limits : tuple of float
