@@ -24,7 +24,7 @@ _SHARE_OF_WATCHDOG = 0.6
 """Share of the time of an instrument's watchdog that a request and its repetitions may take together on a busy
 computer; as long as its line may be lost (`bench.execution.station.reconnection`)."""
 
-_LONGEST_WITHOUT_WATCHDOG = 1.0
+LONGEST_WITHOUT_WATCHDOG = 1.0
 """Longest wait for an answer on a busy computer, s, of an instrument that has no watchdog."""
 
 
@@ -147,12 +147,17 @@ def patient(port: Any, settings: SerialSettings, measure: Callable[[], float] = 
     """Return a port that waits longer while the computer is busy; an emulated one has the laboratory's time."""
     if settings.port.startswith(EMULATED):
         return port
+    return PatientPort(port, longest_wait(settings), measure)
+
+
+def longest_wait(settings: SerialSettings) -> float:
+    """Return how long an answer is waited for on a line at most, however busy the computer is, s."""
     watchdog = getattr(settings, "watchdog", 0.0)
-    longest = _SHARE_OF_WATCHDOG * watchdog / (1 + RESENDS) if watchdog else _LONGEST_WITHOUT_WATCHDOG
+    longest = _SHARE_OF_WATCHDOG * watchdog / (1 + RESENDS) if watchdog else LONGEST_WITHOUT_WATCHDOG
     if settings.line:
         # Its neighbours wait with it.
         longest = min(longest, LONGEST_TURN * settings.timeout / settings.longest_turn)
-    return PatientPort(port, longest, measure)
+    return max(longest, settings.timeout)
 
 
 def patience_of(port: Any, settings: SerialSettings) -> float:  # noqa: ANN401 - pyserial is untyped
@@ -403,14 +408,17 @@ def open_port(device: str, settings: SerialSettings, **options: object) -> Any: 
 
 
 def open_serial(device: str, settings: SerialSettings, **options: object) -> Any:  # noqa: ANN401
-    """Open the port of every driver, which is locked, and in which no call waits for longer than the time-out."""
-    return open_locked(device, settings.port, timeout=settings.timeout, baudrate=settings.baudrate, **options)
+    """Open the port of every driver, which is locked, and in which no call waits for ever."""
+    options = {"baudrate": settings.baudrate, "write_timeout": longest_wait(settings), **options}
+    return open_locked(device, settings.port, timeout=settings.timeout, **options)
 
 
 def open_locked(device: str, port: str, *, timeout: float, **options: object) -> Any:  # noqa: ANN401
     """Open a port of pyserial of any kind; see `open_serial`."""
+    # On a busy computer pyserial calls a write late that has sent all its bytes.
+    longest = max(timeout, LONGEST_WITHOUT_WATCHDOG)
     try:
-        given = {"timeout": timeout, "write_timeout": timeout, "exclusive": True, **options}
+        given = {"timeout": timeout, "write_timeout": longest, "exclusive": True, **options}
         return serial.serial_for_url(port, **given)
     except Exception as error:  # pyserial passes on system errors that are no OSError
         raise cannot_open(device, port, error) from None

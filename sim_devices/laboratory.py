@@ -6,18 +6,19 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
 
 from bench.base import Clock, ConfigurationError, VirtualClock
-from bench.rig import LaboratorySettings, ScheduledFault
+from bench.rig import JOIN, LaboratorySettings, ScheduledFault
 from sim_devices import protocol_emulated
 from sim_devices.faults.calendar import Calendar
 from sim_devices.faults.fault import Fault, FaultEvent, Quantity
 from sim_devices.faults.instrument import instrument_faults
-from sim_devices.faults.line import AnswerFault, FaultyLine, FaultySerial, FaultyTcpServer
+from sim_devices.faults.line import AnswerFault, Cable, FaultyLine, FaultySerial, FaultyTcpServer
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.wire import TcpServer, WireServer
 from sim_devices.world import World
@@ -135,7 +136,8 @@ class EmulatedLaboratory:
                 FaultyTcpServer(server, line) if isinstance(server, TcpServer) else FaultySerial(server, line)
             )
             every |= line.faults() | instrument_faults(name, instruments.get(name), line)
-        self.faults: Mapping[str, Fault] = MappingProxyType(every)
+        self._renumbered = self._renumberings()
+        self.faults: Mapping[str, Fault] = MappingProxyType(every | self._renumbered)
 
     @property
     def servers(self) -> Mapping[str, WireServer | TcpServer]:
@@ -192,7 +194,9 @@ class EmulatedLaboratory:
     def mend(self, instrument: str) -> None:
         """End all faults of the line of an instrument."""
         self._present()
-        for fault in [each for each in self._ends if each in self.lines[instrument].faults()]:
+        own = self.lines[instrument].faults()
+        shared = [each for each in self._renumbered if instrument in each.partition(".")[0].split(JOIN)]
+        for fault in [each for each in self._ends if each in own or each in shared]:
             self.end(fault)
 
     def schedule(self, faults: Sequence[ScheduledFault]) -> None:
@@ -237,6 +241,29 @@ class EmulatedLaboratory:
     def next_change(self) -> float:
         """Return the laboratory time (s) of the next fault that begins or ends; infinity if there is none."""
         return self._calendar.deadline()
+
+    def _renumberings(self) -> dict[str, Fault]:
+        """Return by `A+B.renumber` how each two serial lines that follow one another change places."""
+        serial = [name for name, server in self._servers.items() if isinstance(server, FaultySerial)]
+        return {
+            f"{first}{JOIN}{second}.renumber": Fault(
+                f"the ports of {first} and {second} are lost, and come back with each other's number",
+                partial(self._exchange_ports, first, second),
+                {"seconds": Quantity(2.0, "s", 0.0, 3600.0, "time for which both are away")},
+                partial(self._exchange_ports, first, second, 0.0),
+            )
+            for first, second in pairwise(serial)
+        }
+
+    def _exchange_ports(self, first: str, second: str, seconds: float) -> None:
+        ports = [self._servers[first], self._servers[second]]
+        assert isinstance(ports[0], FaultySerial)
+        assert isinstance(ports[1], FaultySerial)
+        ports[0].exchange_with(ports[1])
+        for name in (first, second):
+            line = self.lines[name]
+            line.break_off(Cable.UNPLUGGED)
+            self.at(self._present() + seconds, partial(line.mend_from, Cable.UNPLUGGED))
 
     def _fault(self, name: str) -> Fault:
         if name not in self.faults:

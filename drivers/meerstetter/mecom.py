@@ -118,9 +118,9 @@ class TECLine(RepeatingLine):
             self._wait_for(patience)
 
     def _wait_for(self, patience: float) -> None:
-        # pyserial sets an open port up anew, and a lost one says that it is lost at the next request.
+        # pyserial sets an open port up again, and a lost one says that it is lost at the next request.
         with suppress(serial.SerialException, OSError):
-            self.port.timeout = self.port.write_timeout = patience
+            self.port.timeout = patience
 
     def ask(self, request: str, digits: int) -> str:
         """Send a query; return the `digits` characters of its answer.

@@ -15,7 +15,16 @@ from contextlib import suppress
 from can import CanError
 from can.interfaces.slcan import slcanBus
 
-from drivers.serial_line import OpenPort, SerialSettings, Share, cannot_open, patience_of, patient, shared_port
+from drivers.serial_line import (
+    OpenPort,
+    SerialSettings,
+    Share,
+    cannot_open,
+    longest_wait,
+    patience_of,
+    patient,
+    shared_port,
+)
 
 _MOST_READS = 4096
 _LONGEST_LINE = 64
@@ -121,7 +130,7 @@ class SlcanAdapter(slcanBus):
         """Send a line within the time-out; python-can's own waits for the last byte, however long it takes."""
         port = self.serialPortOrig
         if port.write_timeout is None:
-            port.write_timeout, port.exclusive = self._settings.timeout, True
+            port.write_timeout, port.exclusive = longest_wait(self._settings), True
         port.write(string.encode() + self.LINE_TERMINATOR)
 
     def _abandon(self) -> None:

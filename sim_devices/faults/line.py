@@ -126,6 +126,8 @@ class FaultyLine:
         The state of the line.
     is_watched : bool
         Whether anything is, or will be, wrong: until then bytes pass as they are.
+    server : Answering
+        The server at its end.
     streams : list of FaultyStream
         The serial line, or the connections that are open.
     """
@@ -144,7 +146,7 @@ class FaultyLine:
         self.schedule = schedule
         self.is_watched = False
         self._name = name
-        self._server = server
+        self.server = server
         self._rng = rng
         self._ended = ended
         self._disturbances: dict[str, _Disturbance] = {}
@@ -163,7 +165,7 @@ class FaultyLine:
         }
         found = {
             f"{name}.{kind}": Fault(
-                summary.format(name), partial(self.break_off, cable), undo=partial(self._mend_from, cable)
+                summary.format(name), partial(self.break_off, cable), undo=partial(self.mend_from, cable)
             )
             for kind, (cable, summary) in states.items()
         }
@@ -180,15 +182,15 @@ class FaultyLine:
                 undo=partial(self.leave_alone, kind),
                 disturbed=partial(self.disturbed, kind),
                 # A line of text has no check sum, and does not say which question it answers.
-                lies=kind in (CORRUPT, SECOND_CLIENT) and self._server.is_text,
+                lies=kind in (CORRUPT, SECOND_CLIENT) and self.server.is_text,
             )
         return found
 
     def _is_possible(self, kind: str) -> bool:
         if kind in (GARBAGE, SECOND_CLIENT, ECHO):
             # TCP has a check of its own, and a connection for each client.
-            return not isinstance(self._server, TcpServer)
-        return {READDRESS: self._server.has_addresses, COMMA: self._server.is_text}.get(kind, True)
+            return not isinstance(self.server, TcpServer)
+        return {READDRESS: self.server.has_addresses, COMMA: self.server.is_text}.get(kind, True)
 
     def watch(self) -> None:
         """Look at all bytes from now on."""
@@ -207,7 +209,7 @@ class FaultyLine:
         """Make the line whole; answers that a hanging one owes are given now."""
         self.cable = Cable.WHOLE
 
-    def _mend_from(self, cable: Cable) -> None:
+    def mend_from(self, cable: Cable) -> None:
         """Make the line whole if it is in this state; it may be in another one that began later."""
         if self.cable is cable or (cable is Cable.CUTTING and self.cable is Cable.CUT):
             self.mend()
@@ -240,7 +242,7 @@ class FaultyLine:
         """Return what the client gets of the answer to a request: pieces, each with its delay, s."""
         if self.cable in _DEAD:
             return []
-        begin = self._server.answer_begins(answer)
+        begin = self.server.answer_begins(answer)
         adapter, answer = answer[:begin], answer[begin:]
         sent = [(0.0, adapter)] if adapter else []
         if not answer:
@@ -265,9 +267,9 @@ class FaultyLine:
         if COMMA in kinds:
             answer = answer.replace(b".", b",")
         if READDRESS in kinds:
-            answer = self._server.readdressed(answer)
+            answer = self.server.readdressed(answer)
         if CORRUPT in kinds:
-            answer = self._server.corrupted(answer, self._rng)
+            answer = self.server.corrupted(answer, self._rng)
         delay, answer = kinds.get(DELAY, 0.0), before + answer
         pieces = [(delay, answer)]
         if HALVE in kinds:
@@ -381,6 +383,12 @@ class FaultySerial(FaultyStream, WireServer):
         self.protocol = server.protocol
         self.hears_others = server.hears_others
         line.streams.append(self)
+
+    def exchange_with(self, other: FaultySerial) -> None:
+        """Lead to the instrument of another line, whose port then leads to this one's."""
+        self._inner, other._inner = other._inner, self._inner
+        self.hears_others, other.hears_others = other.hears_others, self.hears_others
+        self._line.server, other._line.server = other._line.server, self._line.server
 
 
 class FaultyConnection(FaultyStream):

@@ -139,15 +139,17 @@ class Bed:
         return carry_out(run, Console(file=io.StringIO(), width=200)).outcome
 
     def devices_at(self, fault: str) -> list[str]:
-        """Return the devices at the instrument at fault; none of a fault of the plant."""
-        instrument = fault.rpartition(".")[0]
-        on_line = [
-            each.name
-            for each in self.file.devices
-            if instrument in str(getattr(each.settings, "port", "")).removeprefix(EMULATED).split(JOIN)
-        ]
-        # An instrument on a line that several share has the name of its device.
-        return [name for name in on_line if name == instrument] or on_line
+        """Return the devices at the instruments at fault; none of a fault of the plant."""
+        found: list[str] = []
+        for instrument in fault.rpartition(".")[0].split(JOIN):
+            on_line = [
+                each.name
+                for each in self.file.devices
+                if instrument in str(getattr(each.settings, "port", "")).removeprefix(EMULATED).split(JOIN)
+            ]
+            # An instrument on a line that several share has the name of its device.
+            found += [name for name in on_line if name == instrument] or on_line
+        return found
 
     def named(self, fault: str, status: str, reason: str) -> str:
         """Judge whether a message names what is at fault."""

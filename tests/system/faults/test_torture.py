@@ -44,6 +44,7 @@ def cell(rig, fault, seed=1):
         (PYMEASURE, "supply.cut"),
         ("sma", "load_cell.exchange"),
         ("sma", "load_cell.echo"),
+        ("sma", "supply+load_cell.renumber"),
     ],
 )
 def test_a_run_with_a_fault_ends_safe_and_true(rig, fault):

@@ -572,7 +572,7 @@ def test_addresses(port, right):
         ({"stop_bits": 2}, {"stopbits": 2}),
         ({"flow_control": "rts-cts"}, {"rtscts": True, "xonxoff": False, "dsrdtr": False}),
         ({"flow_control": "dtr-dsr"}, {"dsrdtr": True, "rtscts": False}),
-        ({"baudrate": 19200, "timeout": 0.5}, {"baudrate": 19200, "timeout": 0.5, "write_timeout": 0.5}),
+        ({"baudrate": 19200, "timeout": 0.5}, {"baudrate": 19200, "timeout": 0.5}),
     ],
 )
 def test_a_serial_port_is_set_up_as_the_rig_file_says(stack, changes, options):

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 import tty
 
 import pytest
@@ -86,6 +87,20 @@ def test_a_port_that_is_open_here_is_refused_until_it_is_closed(node):
     assert ("opened it already" in str(refusal.value)) == (sys.platform == "linux")
     port.close()
     opened(node).close()
+
+
+def test_a_request_that_a_busy_computer_sends_late_is_sent(node, monkeypatch):
+    send = os.write
+
+    def late(descriptor, data):
+        threading.Event().wait(0.15)
+        return send(descriptor, data)
+
+    port = opened(node)
+    assert port.timeout == 0.1
+    monkeypatch.setattr(os, "write", late)
+    port.write(b"*IDN?")
+    port.close()
 
 
 class Chatter(WireServer):

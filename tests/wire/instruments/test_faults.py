@@ -144,6 +144,21 @@ def test_each_protocol_with_addresses_readdresses_its_answers(rig):
         assert len(wrong) == len(right), name
 
 
+def test_two_ports_that_change_their_numbers_are_away_and_lead_to_each_others_instrument():
+    laboratory, clock = make("sma")
+    cell, stage = (laboratory.servers[name] for name in ("load_cell", "stage"))
+    asked = {line: QUESTIONS[line.protocol] for line in (cell, stage)}
+    right = {line: line.receive(question) for line, question in asked.items()}
+    laboratory.inject("load_cell+stage.renumber", {"seconds": 2.0})
+    assert cell.receive(asked[stage]) == b""
+    clock.sleep(2.1)
+    assert cell.receive(asked[stage]) == right[stage]
+    assert stage.receive(asked[cell]) == right[cell]
+    assert cell.receive(asked[cell]) == b""
+    laboratory.mend("stage")
+    assert {line: line.receive(question) for line, question in asked.items()} == right
+
+
 @pytest.mark.parametrize("fault", ["unplug", "hang"])
 def test_a_dead_line_is_back_when_the_fault_ends(vo2, ask, fault):
     laboratory, clock, _ = vo2
