@@ -19,7 +19,6 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
 
 from bench.analysis import (
     ALL,
@@ -47,7 +46,7 @@ from bench.analysis import (
     select_runs,
     time_names,
 )
-from bench.base import ConfigurationError, DeviceError, VirtualClock, show_patience, wall_time
+from bench.base import ConfigurationError, DeviceError, PlainConsole, VirtualClock, show_patience, wall_time
 from bench.batch import published_of
 from bench.deployment import Deployment, Real, controller_of_rig, deploy as export_model
 from bench.execution import Rehearsal, Run, carry_out, foresee
@@ -164,7 +163,7 @@ def run(
             live=live,
             recording=recording,
         ),
-        Console(quiet=not progress),
+        PlainConsole(quiet=not progress),
     )
     outcome = result.outcome
     unsafe = ", ".join(name for name, state in outcome.safe_state.items() if state != SAFE)
@@ -249,7 +248,7 @@ def identify(
     times = time_names(paths[0]) if is_compared and time is None and len(paths) == 1 else ()
     columns = input_and_output(paths[0], (input or "", output or ""), reading, table)
     names = ColumnNames(*columns, time, options.pop("weights_column", None), times)
-    with show_patience(f"reading and fitting {paths[0].name}", Console(stderr=True)):
+    with show_patience(f"reading and fitting {paths[0].name}", PlainConsole(stderr=True)):
         data = read_dataset(paths, names, reading, at_least=FEWEST_ROWS, table=table)
         if not is_compared:
             return identify_model(data, model, FitOptions.of(options)).with_uncertainty()
@@ -416,7 +415,7 @@ def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> Repo
     """
     folder = _folder(source)
     published = published_of(folder)
-    console = Console()
+    console = PlainConsole()
     console.quiet = console.is_jupyter
     found = report_run(folder, [_model(model) for model in models], None, console, published=published)
     return Report(found)
@@ -450,7 +449,7 @@ def rehearse(
     """
     definition = find_protocol(protocol) if isinstance(protocol, str) else protocol
     asked = Run(definition, parameters, str(rig), Path(), overrides=overrides or {}, seed=seed)
-    return foresee(asked, Console(stderr=True))
+    return foresee(asked, PlainConsole(stderr=True))
 
 
 def runs(

@@ -61,7 +61,7 @@ class CompilationDisplay(event.Listener):
         """Print the line, if it is the first compilation."""
         if not CompilationDisplay._said:
             CompilationDisplay._said = True
-            self._console.print(MESSAGE, highlight=False, soft_wrap=True)
+            self._console.print(MESSAGE, soft_wrap=True)
 
     def on_end(self, event: Any) -> None:  # noqa: ANN401 - numba's form
         """Do nothing."""

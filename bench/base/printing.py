@@ -22,8 +22,12 @@ _COMMANDING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\
 class PlainConsole(Console):
     """A console on which a text commands nothing, whoever wrote it: an instrument, a file, or another user.
 
-    Characters that would are shown as U+FFFD.
+    A text is printed as it is: brackets and colons in it are no markup. Characters that would command the terminal
+    are shown as U+FFFD. Colours come from `rich.text.Text`, or from a style.
     """
+
+    def __init__(self, **options: Any) -> None:  # noqa: ANN401 - those of rich's console
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """Yield the segments of what is printed; those of the console itself, such as of its cursor, as they are."""
@@ -36,8 +40,8 @@ class PlainConsole(Console):
 
 
 def print_plain(console: Console, text: str) -> None:
-    """Print a text on one line of any length, such as a path or a name of the user's own: no markup, no colours."""
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+    """Print a text on one line of any length, such as a path or a name of the user's own."""
+    console.print(Text(text), soft_wrap=True)
 
 
 def show_table(console: Console, table: Table) -> None:
@@ -52,7 +56,7 @@ def show_table(console: Console, table: Table) -> None:
     console : Console
         Where to print.
     table : Table
-        Its cells are texts, plain or with markup.
+        Its cells are texts.
     """
     columns = [[_text(console, cell) for cell in column.cells] for column in table.columns]
     heads = [_text(console, column.header) for column in table.columns] if table.show_header else []
@@ -70,7 +74,7 @@ def show_table(console: Console, table: Table) -> None:
         console.print(table)
         return
     if table.title:
-        console.print(table.title, highlight=False, soft_wrap=True, style="table.title")
+        console.print(table.title, soft_wrap=True, style="table.title")
     for row in zip(*columns, strict=True):
         _print_block(console, [head.plain for head in heads], row, table.columns)
 
@@ -95,7 +99,7 @@ def print_table(
 
 
 def show_rows(console: Console, title: str, rows: Iterable[tuple[str, str | Text]]) -> None:
-    """Print (name, text) pairs under a title; a `str` may have markup."""
+    """Print (name, text) pairs under a title."""
     table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
@@ -118,16 +122,16 @@ def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], title: str =
 def _print_block(console: Console, heads: Sequence[str], row: Sequence[Text], columns: Sequence[Column]) -> None:
     name, *others = row
     if name.plain.strip():
-        console.print(name, style="bold", highlight=False, soft_wrap=True)
+        console.print(name, style="bold", soft_wrap=True)
     for i, (text, column) in enumerate(zip(others, columns[1:], strict=True), 1):
         if text.plain.strip():
             head = f"{heads[i]}: " if heads and heads[i] else ""
             line = Text.assemble(_INDENT, head, text)
-            console.print(line, style=column.style, highlight=False, soft_wrap=True)
+            console.print(line, style=column.style, soft_wrap=True)
 
 
 def _text(console: Console, cell: RenderableType) -> Text:
-    return cell if isinstance(cell, Text) else console.render_str(str(cell), highlight=False)
+    return cell if isinstance(cell, Text) else console.render_str(str(cell))
 
 
 def _longest_line(text: Text) -> int:

@@ -250,7 +250,7 @@ class ResultTable:
             table.add_row(*(cell.format_map(values) for cell in row))
         show_table(console, table)
         if self.note:
-            console.print(self.note.format_map(values), highlight=False)
+            console.print(self.note.format_map(values))
 
     def markdown(self, values: Mapping[str, Any]) -> str:
         """Return it as a table of a Markdown text, the title in bold above and the note below."""

@@ -145,9 +145,11 @@ def _carry_out(arguments: Sequence[str] | None) -> NoReturn:
         raise
     # As typer ends a command at Ctrl-C: without a word.
     if code == AbortError.exit_code:
+        from rich.text import Text
+
         from bench.cli.printing import error_console
 
-        error_console.print(f"[yellow]ended by Ctrl-C:[/] {_state_of_outputs(words)}", highlight=False)
+        error_console.print(Text("ended by Ctrl-C:", "yellow"), _state_of_outputs(words))
     sys.exit(exit_code(code or 0))
 
 

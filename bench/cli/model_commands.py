@@ -241,13 +241,13 @@ def identify_(
     # Before anything is printed: a terminal that fails must not cost the fit.
     if out is not None:
         found.file.save(out)
-    console.print(fit_sentence(found, None if selected is None else selected.error_left_out), highlight=False)
+    console.print(fit_sentence(found, None if selected is None else selected.error_left_out))
     print_assumptions(data.name, data.assumptions)
     if selected is not None:
         print_choice(selected, comparing)
     if found.trials is not None:
         console.print(f"cross-validation, errors in {found.file.response.output_unit or 'output units'}:")
-        console.print(found.trials.table(), highlight=False, markup=False)
+        console.print(found.trials.table())
     for warning in found.warnings:
         warn(warning)
     print_rows(f"{model} from {data.name}", certificate_lines(found, verbose=fitting.verbose))

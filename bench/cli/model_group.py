@@ -83,7 +83,7 @@ def models_on_data(
     for warning in result.warnings:
         warn(warning)
     if result.skip:
-        console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
+        console.print(f"rows 1 to {result.skip} are left out of the errors")
     heads = ("model", "max", "RMS", "RMS / %", "offset", "max, offset removed", "RMS, offset removed")
     rows = [
         (

@@ -103,8 +103,8 @@ def options_json(spec: ModelSpec) -> dict[str, dict[str, str]]:
 
 def print_model(spec: ModelSpec) -> None:
     """Print the summary of a model, its inverse and its options."""
-    console.print(spec.summary, highlight=False)
-    console.print(f"inverse: {inverse_of(spec)}", highlight=False)
+    console.print(spec.summary)
+    console.print(f"inverse: {inverse_of(spec)}")
     options = options_json(spec)
     if options:
         rows = [(name, f"{each['text']} (default: {each['default']})") for name, each in options.items()]

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.padding import Padding
+from rich.text import Text
 
 from bench.base import ConfigurationError, closest, print_plain
 from bench.cli.command_support import JsonOption, write_json
@@ -62,7 +63,7 @@ def show(
         print_model(specs[name])
         write_json(json_file, {"name": name, **_model_json(specs[name])})
     elif name in (others := {**catalogue.studies, **catalogue.controllers}):
-        console.print(others[name], highlight=False)
+        console.print(others[name])
         write_json(json_file, {"name": name, "summary": others[name]})
     else:
         known = closest(name, [*catalogue.rigs, *catalogue.protocols, *specs, *others], "`bench list`")
@@ -77,7 +78,7 @@ def _model_json(spec: Any) -> dict[str, Any]:  # noqa: ANN401 - a ModelSpec, not
 
 def _print_listing(listed: Mapping[str, Any]) -> None:
     def titles(group: str) -> dict[str, str]:
-        packages = {name: f" \\[{package}]" for name, package in listed["packages"].items()}
+        packages = {name: f" [{package}]" for name, package in listed["packages"].items()}
         return {name: text + packages.get(name, "") for name, text in listed[group].items()}
 
     alike: dict[tuple[str, ...], dict[str, str]] = {}
@@ -86,8 +87,8 @@ def _print_listing(listed: Mapping[str, Any]) -> None:
     for protocols, rigs in alike.items():
         print_rows("rigs", rigs.items())
         names = ", ".join(name + "*" * (name in listed["take_a_model"]) for name in protocols) or "none"
-        text = f"[dim]protocols (*: takes a model file):[/] {names}"
-        console.print(Padding(text, (1, 0, 1, 4), expand=False), highlight=False)
+        text = Text.assemble(("protocols (*: takes a model file):", "dim"), f" {names}")
+        console.print(Padding(text, (1, 0, 1, 4), expand=False))
     for group in ("protocols", "models", "controllers"):
         print_rows(group, titles(group).items())
         console.print()

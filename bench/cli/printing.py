@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.markup import escape
+from rich.text import Text
 
 from bench.base import BenchError, PlainConsole, counted, print_plain, show_rows
 
@@ -23,12 +23,12 @@ error_console = PlainConsole(stderr=True)
 def print_error(error: BenchError) -> None:
     """Print an error of the bench, a line each of its lines."""
     for line in str(error).splitlines():
-        error_console.print("[bold red]error:[/]", escape(line), highlight=False, soft_wrap=True)
+        error_console.print(Text("error:", "bold red"), line, soft_wrap=True)
 
 
 def warn(text: str) -> None:
     """Print a warning."""
-    error_console.print("[yellow]warning:[/]", escape(text), highlight=False, soft_wrap=True)
+    error_console.print(Text("warning:", "yellow"), text, soft_wrap=True)
 
 
 @contextmanager

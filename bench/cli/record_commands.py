@@ -129,7 +129,7 @@ def runs_(
         rig=rig,
     )
     _print_runs(folder, found)
-    console.print(counted(len(found), "run"), highlight=False)
+    console.print(counted(len(found), "run"))
     write_json(json_file, [run.to_json() for run in found])
 
 
@@ -155,7 +155,7 @@ def _print_runs(folder: Path, runs: list[ListedRun]) -> None:
         if listed is not None:
             parameters = ", ".join(f"{name}={value}" for name, value in listed.changed.items())
             for text in filter(None, (parameters, listed.result, _named(listed.folder, folder))):
-                console.print(Text(f"    {text}"), soft_wrap=True, highlight=False)
+                console.print(Text(f"    {text}"), soft_wrap=True)
 
 
 def _named(run: Path, folder: Path) -> str:
@@ -203,7 +203,7 @@ def import_(
     names = ColumnNames(input_column, output_column, time_column, others=tuple(others or ()))
     found = import_file(file, names, title=title, out=out, reading=reading)
     print_assumptions(file.name, found.assumptions)
-    console.print(counted(found.rows, "reading"), highlight=False)
+    console.print(counted(found.rows, "reading"))
     print_plain(console, f"run: {found.folder}")
     write_json(json_file, {"folder": str(found.folder), "rows": found.rows, "assumptions": found.assumptions})
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from bench.base import AbortError, ConfigurationError, DeviceError, counted, print_plain, show_table, wall_time
 from bench.cli.command_support import (
@@ -80,7 +80,7 @@ def safe(
     for each in found:
         style = "green" if each.is_safe else "bold red"
         state = each.state if each.is_safe else f"NOT CONFIRMED: {each.state}"
-        table.add_row(escape(each.device), f"[{style}]{escape(state)}[/]", escape(each.advice))
+        table.add_row(each.device, Text(state, style), each.advice)
     show_table(console, table)
     write_json(json_file, {each.device: {"state": each.state, "is_safe": each.is_safe} for each in found})
     if not all(each.is_safe for each in found):
@@ -140,7 +140,7 @@ def _print_conditions(conditions: Sequence[object]) -> None:
     for each in conditions:
         assert isinstance(each, Condition)
         style = "green" if each.state == "ready" else "bold red"
-        table.add_row(escape(each.device), f"[{style}]{each.state}[/]", escape(each.meaning))
+        table.add_row(each.device, Text(each.state, style), each.meaning)
     show_table(console, table)
 
 
@@ -191,9 +191,8 @@ def check(
         for finding in (*([CheckFinding("instrument", check.identity)] if check.identity else ()), *check.findings)
     ]
     table = Table(*heads, box=None, padding=(0, 2))
-    for row in rows:
-        device, what, text, advice = map(escape, row)
-        table.add_row(f"[bold]{device}[/]", what, f"[{'yellow' if advice else 'default'}]{text}[/]", advice)
+    for device, what, text, advice in rows:
+        table.add_row(Text(device, "bold"), what, Text(text, "yellow" if advice else ""), advice)
     show_table(console, table)
     code = 0
     if any(finding.advice for check in checks for finding in check.findings):
@@ -204,7 +203,7 @@ def check(
         code = UNSAFE_EXIT_CODE
     count = sum(bool(finding.advice) for check in checks for finding in check.findings)
     verdict = f"{count} to look at" if count else "all is well"
-    console.print(verdict, highlight=False)
+    console.print(verdict)
     if html is not None:
         from bench.analysis import Page, PageSection, PageTable, write_page
 

@@ -44,7 +44,7 @@ def find_run(given: str | Path) -> Path:
         if not 1 <= number <= len(runs):
             there = f"has {counted(len(runs), 'run')}" if runs else "has no runs; bench run makes one"
             raise ConfigurationError(f"{text}: {RECORDINGS} {there}" if text != "@1" else f"{RECORDINGS} {there}")
-        error_console.print(f"[dim]run: {runs[number - 1]}[/]", highlight=False, soft_wrap=True)
+        error_console.print(f"run: {runs[number - 1]}", style="dim", soft_wrap=True)
         return runs[number - 1]
     path = Path(text)
     if path.is_dir():

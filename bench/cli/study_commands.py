@@ -142,7 +142,7 @@ def campaign(
         check_address(scheduler)
     before = done_before(expansion.tasks, folder)
     cores = 1 if scheduler else workers or available_cores()
-    console.print(expansion.announcement(before.done, cores), highlight=False)
+    console.print(expansion.announcement(before.done, cores))
     if dry_run:
         for line in expansion.listing(before.done):
             print_plain(console, line)

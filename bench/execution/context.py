@@ -399,7 +399,7 @@ def _open_view(dashboard: Dashboard, console: Console) -> None:
         open_viewer(dashboard.uri)
         print_plain(console, f"live view: {dashboard.uri}; bench view opens it again")
     else:
-        console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
+        print_plain(console, f"live view: run rerun {dashboard.uri} in another terminal")
 
 
 def _checked(
@@ -462,8 +462,6 @@ def _rehearsed(
     if twin is None:
         console.print(
             f"not rehearsed: rig {file.name} has no emulated twin; its file can name one: [rig] twin",
-            highlight=False,
-            markup=False,
             soft_wrap=True,
         )
         return None

@@ -160,7 +160,7 @@ class Dialogue:
             self._say(self._status(question))
             if self._lines is not None:
                 self._lines.ask()
-                self._console.print("> ", end="", highlight=False)
+                self._console.print("> ", end="")
 
     def _status(self, question: Question) -> str:
         seconds = 0.0 if self._since is None else self._since.seconds()

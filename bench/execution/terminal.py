@@ -251,8 +251,6 @@ class ProgressDisplay:
             self._console.print(
                 f"{format_duration(event.t):>10}  {event.kind}: {event.text}",
                 style=style,
-                highlight=False,
-                markup=False,
                 # A line of a log is not folded.
                 soft_wrap=not self._console.is_terminal,
             )

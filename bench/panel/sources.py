@@ -9,9 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from rich.console import Console
-
-from bench.base import BenchError, ConfigurationError, DataError, Interrupts, format_duration
+from bench.base import BenchError, ConfigurationError, DataError, Interrupts, PlainConsole, format_duration
 from bench.execution import Run, RunResult, carry_out
 from bench.operator import END, PAUSE, SYNTAX, Desk, Leave, PanelMailbox, Shown, parse_command
 from bench.protocol import ByHand, Messages, ProtocolParameters, protocol
@@ -182,7 +180,7 @@ def carry_out_by_hand(desk: Desk, interrupts: Interrupts, **asked: Any) -> RunRe
         yield ByHand(desk=desk)
 
     run = Run(protocol=by_hand, settings={}, recording=False, rehearse=False, **asked)
-    return carry_out(run, Console(file=_Log(desk), width=200), interrupts)
+    return carry_out(run, PlainConsole(file=_Log(desk), width=200), interrupts)
 
 
 class RunInProgress:

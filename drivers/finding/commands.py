@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from bench.base import ConfigurationError, show_table, write_whole
@@ -72,7 +71,7 @@ def find(
     known = ports([*(further or []), *asked], hosts or [], search=attach is None)
     table = Table("port", "description", "USB serial number", "remark", box=None, padding=(0, 2))
     for each in known:
-        table.add_row(*map(escape, (each.name, each.description, each.serial_number, each.problem)))
+        table.add_row(each.name, each.description, each.serial_number, each.problem)
     show_table(console, table)
     if rig is None or file is None:
         write_json(json_file, {"ports": [asdict(each) for each in known], "devices": {}})
@@ -81,7 +80,7 @@ def find(
     table = Table("device", "port", "instrument", "remark", box=None, padding=(0, 2))
     for one in placed:
         port, identity = ("–", "–") if one.answer is None else (one.answer.port.name, str(one.answer.identity))
-        table.add_row(*map(escape, (one.device, port, identity, one.remark)))
+        table.add_row(one.device, port, identity, one.remark)
     console.print()
     show_table(console, table)
     if write:
@@ -109,4 +108,4 @@ def _write(path: Path, found: Iterable[Mapping[tuple[str, str], Mapping[str, Any
                 for key in keys.keys() & device.keys() if device.get("line") == name else ():
                     del device[key]
     write_whole(path, tomlkit.dumps(document))
-    console.print(f"written: {path}", highlight=False)
+    console.print(f"written: {path}")

@@ -122,7 +122,6 @@ def emulate(
             console.print(
                 f"{each_served.name}: {each_served.clock.now():.1f} s of laboratory time, "
                 f"{reached:.3g} times as fast as the wall clock (of {each_served.clock.factor:g})",
-                highlight=False,
             )
 
 
@@ -223,4 +222,4 @@ def _print(served: Sequence[ServedLaboratory], control: str) -> None:
         for name, endpoint in each.endpoints().items():
             table.add_row(each.name, name, ", ".join(endpoint["devices"]), endpoint["protocol"], endpoint["port"])
     console.print(table)
-    console.print(f"control: {control}; Ctrl-C ends", highlight=False)
+    console.print(f"control: {control}; Ctrl-C ends")

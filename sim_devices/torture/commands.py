@@ -9,8 +9,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from bench.base import show_table
 from bench.cli import JsonOption, console, parse_assignments, write_json
@@ -52,15 +52,15 @@ def torture(
     task = Task(rig, parse_assignments("--override", overrides or []))
     wanted = faults_of(task, device, fault)
     task = largest_excursion(task)
-    console.print(f"{len(wanted)} faults, {seeds} seeds; moved over {task.share:.0%} of the ranges", highlight=False)
+    console.print(f"{len(wanted)} faults, {seeds} seeds; moved over {task.share:.0%} of the ranges")
     done = [*cells(task, wanted, seeds, processes, console)]
     failed = [cell for cell in done if cell.failures]
     show_table(console, table(done))
     for cell in failed:
         for check in cell.failures:
             text = f"{cell.fault} seed {cell.seed}: {check}: {cell.results[check]} ({cell.status}: {cell.reason})"
-            console.print(text, highlight=False, markup=False, soft_wrap=True)
-    console.print(f"{len(done) - len(failed)} of {len(done)} runs passed", highlight=False)
+            console.print(text, soft_wrap=True)
+    console.print(f"{len(done) - len(failed)} of {len(done)} runs passed")
     write_json(json_file, {"rig": rig, "share": task.share, "runs": [asdict(cell) for cell in done]})
     if failed:
         sys.exit(1)
@@ -80,7 +80,7 @@ def table(done: Iterable[Cell]) -> Table:
             bad = sum(check in cell.failures for cell in row)
             kinds = {cell.results[check] for cell in row}
             passed = "w" if "w" in kinds else "." if kinds == {"."} else "ok"
-            marks.append(f"[red]{len(row) - bad}/{len(row)}[/]" if bad else passed)
+            marks.append(Text(f"{len(row) - bad}/{len(row)}", "red") if bad else Text(passed))
         ended = ", ".join(f"{count} {status}" for status, count in Counter(cell.status for cell in row).items())
-        drawn.add_row(escape(row[0].device or "–"), escape(name), ended, *marks)
+        drawn.add_row(row[0].device or "–", name, ended, *marks)
     return drawn

@@ -14,7 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
-from bench.base import BenchError, ConfigurationError, VirtualClock, Workers, json_text
+from bench.base import BenchError, ConfigurationError, PlainConsole, VirtualClock, Workers, json_text
 from bench.devices import Actuator
 from bench.execution import Run, carry_out
 from bench.protocol import ProtocolDefinition
@@ -136,7 +136,7 @@ class Bed:
             self.protocol, {}, self.file.name, folder, seed=seed, clock="virtual", recording=False, faults=faults,
             rig_file=self.file,
         )  # fmt: skip
-        return carry_out(run, Console(file=io.StringIO(), width=200)).outcome
+        return carry_out(run, PlainConsole(file=io.StringIO(), width=200)).outcome
 
     def devices_at(self, fault: str) -> list[str]:
         """Return the devices at the instruments at fault; none of a fault of the plant."""

@@ -57,6 +57,8 @@ class TestHelp:
         assert code == 0
         bench("show", protocol, "--json", tmp_path / "list.json")
         shown = {entry["name"]: entry for entry in json.loads((tmp_path / "list.json").read_text())["parameters"]}
+        # As everywhere, what stands in brackets.
+        assert "[default: rehearse]" in out
         for name, (default, unit) in parameters.items():
             assert name in out
             assert (shown[name]["default"], shown[name]["unit"]) == (default, unit)

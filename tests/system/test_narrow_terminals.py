@@ -113,6 +113,16 @@ class TestTextsOfOthers:
         assert not set("\x1b\x07\r\x9b\u202e\u2066\u200f") & set(text)
         assert text.count("error") == 2
 
+    def test_brackets_and_colons_are_no_markup(self):
+        console = PlainConsole(file=io.StringIO(), width=200, force_terminal=True)
+        table = Table("[name]", title="[all]")
+        table.add_row("[red]cell")
+        texts = "[bold]a[/] :smile:", "[red]cell", "[name]", "[all]"
+        console.print(texts[0])
+        show_table(console, table)
+        for text in texts:
+            assert text in console.file.getvalue()
+
     def test_a_bar_still_moves_the_cursor(self):
         console = PlainConsole(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
         with ProgressDisplay(console, "creep\x1b[1G", SIGNALS, [], LONG, 1.0) as display:

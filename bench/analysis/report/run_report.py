@@ -130,7 +130,7 @@ def _print_card(meta: Mapping[str, Any], console: Console) -> None:
 
 def _print_status(record: Record, steps: int, console: Console) -> None:
     style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
-    console.print(f"[{style}]{record.status}[/] after {steps_of(record.meta, steps)}", highlight=False)
+    console.print(Text(record.status, style), f"after {steps_of(record.meta, steps)}")
     for text in filter(None, [record.reason, *(f"{name}: {state}" for name, state in record.safe_state.items())]):
         print_plain(console, f"  {text}")
 

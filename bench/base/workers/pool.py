@@ -21,6 +21,7 @@ from rich.console import Console
 
 from bench.base.errors import AbortError, BenchError
 from bench.base.interrupts import signal_name
+from bench.base.printing import PlainConsole
 from bench.base.workers.display import TasksDisplay
 from bench.base.workers.messages import Progress, Result, Welcome, Words, receive, send
 from bench.base.workers.task import COLLECTIONS, task_surroundings
@@ -118,7 +119,7 @@ class Workers:
     ) -> None:
         self.number = available_cores() if number is None else number
         self.in_process = self.number == 1
-        self._console = Console(quiet=True) if console is None else console
+        self._console = PlainConsole(quiet=True) if console is None else console
         self._display = TasksDisplay(self._console, title)
         self._kernels = kernels
         self._changed = threading.Condition()

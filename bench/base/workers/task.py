@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
+from bench.base.printing import PlainConsole
+
 Report = Callable[[int, int | None, str], None]
 
 COLLECTIONS = 100_000, 20, 50
@@ -38,7 +40,7 @@ def task_surroundings(console: Console, report: Report | None) -> Iterator[None]
 
 def task_console() -> Console:
     """Return the console for what a task prints: it arrives on the console of the `Workers`."""
-    return Console() if _surroundings is None else _surroundings.console
+    return PlainConsole() if _surroundings is None else _surroundings.console
 
 
 def report(completed: int, total: int | None, text: str) -> None:

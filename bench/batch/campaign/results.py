@@ -90,7 +90,7 @@ class ResultsTable:
             table.add_row(*(Text(shown(cell)) for cell in row))
         console.print(table)
         if len(self) > most:
-            console.print(f"… and {len(self) - most} rows more", highlight=False)
+            console.print(f"… and {len(self) - most} rows more")
 
 
 def shown(cell: Cell) -> str:

@@ -49,7 +49,7 @@ def print_over_seeds(name: str, folders: Sequence[Path], console: Console) -> st
     contents = [parse_json((folder / FILE_NAME).read_text(encoding="utf-8")) for folder in folders]
     values = over_seeds([content["values"] for content in contents])
     head = f"{name}, {len(folders)} seeds: median (least–greatest)"
-    console.print(head, highlight=False)
+    console.print(head)
     tables = [ResultTable(**table) for table in contents[0]["tables"]]
     for table in tables:
         table.print(values, console)

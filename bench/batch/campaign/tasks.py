@@ -10,8 +10,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
-from rich.console import Console
-
 from bench.analysis import (
     FEWEST_ROWS,
     ColumnNames,
@@ -26,7 +24,7 @@ from bench.analysis import (
     results_json,
     whole_identification,
 )
-from bench.base import AbortError, BenchError, DataError, Workers, parse_json, registry, write_json_file
+from bench.base import AbortError, BenchError, DataError, PlainConsole, Workers, parse_json, registry, write_json_file
 from bench.batch.campaign.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
 from bench.batch.campaign.study_tables import FILE_NAME as STUDY_NAME, write_study
 from bench.batch.study import RunSeries, Study
@@ -266,7 +264,7 @@ class RunTask(CampaignTask):
         )
 
     def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
-        result = carry_out(self.run(campaign, made), Console(quiet=True))
+        result = carry_out(self.run(campaign, made), PlainConsole(quiet=True))
         outcome = result.outcome
         if isinstance(outcome.error, AbortError):
             raise outcome.error

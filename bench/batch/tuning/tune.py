@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from bench.base import BenchError, ConfigurationError, wall_time
+from bench.base import BenchError, ConfigurationError, PlainConsole, wall_time
 from bench.batch.tuning.search import ERRORS, MARGIN, TIME_WEIGHT, WORST, TuningTrial, confirm, search
 from bench.batch.tuning.tuning_runs import TuningRuns, TuningTask, start_of, task_of
 from bench.control import ControllerSetup, controller_spec, tuning_text
@@ -83,7 +83,7 @@ def tune(
     """
     from bench.base import Workers
 
-    shown = console or Console(quiet=True)
+    shown = console or PlainConsole(quiet=True)
     file = load_model(model).at_rest()
     task = task_of(file, controller, protocol)
     on = twin or load_rig(rig).rig.twin or rig
@@ -112,10 +112,10 @@ def tune(
     def tell(trial: TuningTrial) -> None:
         trials.append(trial)
         text = f"{len(trials):3}  cost {trial.cost:.4g}  RMS {trial.rms:.4g}  {dict(trial.numbers)}"
-        shown.print(text, highlight=False, markup=False)
+        shown.print(text)
         if len(trials) == 1 and trial.failed:
             begun = f"the search begins with numbers that fail: {runs.failures[0]}"
-            shown.print(begun, highlight=False, markup=False)
+            shown.print(begun)
 
     # What each of many runs says of itself would hide what the search says.
     kernels = ("bench.models", "bench.control", *getattr(tuned_on.laboratory, "kernels", ()))
