@@ -47,7 +47,7 @@ def run(
         typer.Option(
             "--from",
             metavar="RUN",
-            help="Carry this run out again, in place of PROTOCOL; see below.",
+            help="Carry this run out again, in place of PROTOCOL; see above.",
             parser=find_run,
         ),
     ] = None,

@@ -87,7 +87,7 @@ _WATCHDOG_REGISTERS = (
 )
 """In the order of the settings of `_Watchdog`."""
 
-_SETTINGS = tuple(Span.of(register) for register in _WATCHDOG_REGISTERS)
+_SETTINGS = Packet.of([Span.of(register) for register in _WATCHDOG_REGISTERS])
 _DIRECTION, _STATE = Span.of(DIO_DIRECTION), Span.of(DIO_STATE)
 _STATE_PACKET = Packet.of((_STATE,))
 
@@ -127,10 +127,7 @@ class DigitalOutput:
     @property
     def is_on(self) -> bool:
         """Whether the level of the line is the one that is on, as the instrument reports now."""
-        if self._instrument.checks_owner:
-            (state,) = self._instrument.read_packet(_STATE_PACKET)
-        else:
-            ((state,),) = self._instrument.read_spans((_STATE,))
+        (state,) = self._instrument.read_packet(_STATE_PACKET)
         return self._level(state)
 
     def switch(self, on: bool) -> None:
@@ -154,7 +151,7 @@ class DigitalOutput:
         return self._look()
 
     def _look(self, *writes: tuple[int, bytes]) -> bool:
-        (direction,), (state,) = self._instrument.read_spans((_DIRECTION, _STATE), *writes)
+        direction, state = self._instrument.read_packet(Packet.of((_DIRECTION, _STATE), *writes))
         if not int(direction) & self._bit:
             raise DeviceError(
                 self._name,
@@ -231,7 +228,7 @@ class DigitalOutput:
         return bool(watchdog.enabled) and any(map(self._instrument.read_integer, WATCHDOG_DAC_ENABLE))
 
     def _watchdog(self) -> _Watchdog:
-        return _Watchdog(*(int(value) for (value,) in self._instrument.read_spans(_SETTINGS)))
+        return _Watchdog(*map(int, self._instrument.read_packet(_SETTINGS)))
 
     def _change(self, present: _Watchdog, wanted: _Watchdog) -> None:
         if wanted == present:

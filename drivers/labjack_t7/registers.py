@@ -115,25 +115,28 @@ class Span(NamedTuple):
 
 
 class Packet(NamedTuple):
-    """Spans to be read in one packet of function 76 again and again, in their order, and the owner number."""
+    """What one request of function 76 carries out: writes, then spans that are read, then the owner number."""
 
     name: str
-    """What reading them is called in messages."""
+    """What it is called in messages."""
     request: bytes
-    """Asks for them."""
+    """Asks for it."""
     size: int
     """Bytes of the reply."""
     reply: struct.Struct
     """Form of the reply: its function, the values of all spans, and the owner number."""
 
     @classmethod
-    def of(cls, spans: Sequence[Span]) -> Packet:
-        """Return the packet of spans."""
+    def of(cls, spans: Sequence[Span], *writes: tuple[int, bytes]) -> Packet:
+        """Return the packet of spans; what is to be written at addresses goes first in it."""
         read = (*spans, _OWNER_SPAN)
         reply = struct.Struct(">x" + "".join(span.values.format[1:] for span in read))
+        frames = (*(write_frame(*write) for write in writes), *(span.frame for span in read))
         return cls(
-            name=", ".join(span.name for span in spans),
-            request=bytes((FEEDBACK,)) + b"".join(span.frame for span in read),
+            name=", ".join(
+                (*(f"writing register {address}" for address, _ in writes), *(span.name for span in spans))
+            ),
+            request=bytes((FEEDBACK,)) + b"".join(frames),
             size=reply.size,
             reply=reply,
         )
@@ -462,33 +465,14 @@ class LabJackT7:
         return self._carry_out(span.name, span.ask)
 
     def read_packet(self, packet: Packet) -> tuple[float, ...]:
-        """Get the values of several spans in one request, one behind the other; raises what `read_spans` does."""
+        """Carry a packet out; return the values of its spans, one behind the other.
+
+        Raises `DeviceRestartedError` or `DeviceError` also if the owner number is not that of `claim` any more.
+        """
         *values, owner = self._carry_out(packet.name, packet.ask)
         if owner != self._owner and self.checks_owner:
             self._check_owner(int(owner), self._client)
         return tuple(values)
-
-    def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
-        """Get the values of several spans in one request; what is to be written at addresses goes first in it.
-
-        Raises `DeviceRestartedError` or `DeviceError` also if the owner number is not that of `claim` any more.
-        """
-        doing = ", ".join((*(f"writing register {address}" for address, _ in writes), *(span.name for span in spans)))
-        # Before anything is asked whether it is to be checked, as the connection may have to be opened again.
-        self._ensure_open()
-        checks = self.checks_owner
-        if checks:
-            spans = (*spans, _OWNER_SPAN)
-        frames = b"".join((*(write_frame(*write) for write in writes), *(span.frame for span in spans)))
-        size = sum(span.values.size for span in spans)
-        reply = self._carry_out(doing, lambda client: client.feedback(frames, size))
-        values, position = [], 0
-        for span in spans:
-            values.append(list(span.values.unpack_from(reply, position)))
-            position += span.values.size
-        if checks:
-            self._check_owner(int(values.pop()[0]), self._client)
-        return values
 
     def shares_connection(self, other: LabJackT7) -> bool:
         """Return whether another device on the same instrument uses this connection."""
@@ -573,7 +557,7 @@ class LabJackT7:
         """
         first = next(iter(values))
         data = self.encode(first, *values.values())
-        (present,) = self.read_spans((Span.of(first, len(values)),), (first.address, data))
+        present = self.read_packet(Packet.of((Span.of(first, len(values)),), (first.address, data)))
         for (register, value), actual in zip(values.items(), present, strict=True):
             tolerance = 1e-5 if register.kind == "F32" else 0.0
             if not math.isclose(actual, value, rel_tol=tolerance, abs_tol=0.1 * tolerance):

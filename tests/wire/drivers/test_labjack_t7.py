@@ -291,8 +291,11 @@ def test_byte_vectors():
         ("0001 0000 0006 01 03 d73c 0002", "0001 0000 0007 01 03 04 0011 2233"),  # TEST
         ("0002 0000 0006 01 03 d754 0002", "0002 0000 0007 01 03 04 c61c 3c00"),  # TEST_FLOAT32
         ("0003 0000 0006 01 03 0000 0002", "0003 0000 0007 01 03 04 4020 0000"),  # AIN0
-        # AIN0_RANGE, written and read back in one packet, by LabJack's function 76
-        ("0004 0000 000e 01 4c 01 9c40 02 3dcc cccd 00 9c40 02", "0004 0000 0006 01 4c 3dcc cccd"),
+        # AIN0_RANGE, written and read back in one packet, by LabJack's function 76; and USER_RAM39_U32
+        (
+            "0004 0000 0012 01 4c 01 9c40 02 3dcc cccd 00 9c40 02 00 b462 02",
+            "0004 0000 000a 01 4c 3dcc cccd 0000 0000",
+        ),
     )
     with Scripted(*exchanges) as server:
         t7 = LabJackT7("psd", server.address, 2.0)
@@ -409,8 +412,8 @@ def test_byte_vectors_of_a_high_voltage_supply():
         ("0001 0000 000b 01 10 7530 0002 04 0000 0000", "0001 0000 0006 01 10 7530 0002"),  # TDAC0 0 V
         # DIO5 high, then DIO_DIRECTION and DIO_STATE
         (
-            "0002 0000 0010 01 4c 01 07d5 01 0001 00 0b22 02 00 0af0 02",
-            "0002 0000 000a 01 4c 0000 0020 007f ffff",
+            "0002 0000 0014 01 4c 01 07d5 01 0001 00 0b22 02 00 0af0 02 00 b462 02",
+            "0002 0000 000e 01 4c 0000 0020 007f ffff 0000 0000",
         ),
         ("0003 0000 0006 01 03 0000 0006", f"0003 0000 000f 01 03 0c {on}"),  # AIN0, AIN1, AIN2
         ("0004 0000 000b 01 10 7530 0002 04 3f80 0000", "0004 0000 0006 01 10 7530 0002"),  # TDAC0 1 V
@@ -419,11 +422,14 @@ def test_byte_vectors_of_a_high_voltage_supply():
         ("0007 0000 000b 01 10 7530 0002 04 0000 0000", "0007 0000 0006 01 10 7530 0002"),  # safe: TDAC0 0 V
         # DIO5 low
         (
-            "0008 0000 0010 01 4c 01 07d5 01 0000 00 0b22 02 00 0af0 02",
-            "0008 0000 000a 01 4c 0000 0020 007f ffdf",
+            "0008 0000 0014 01 4c 01 07d5 01 0000 00 0b22 02 00 0af0 02 00 b462 02",
+            "0008 0000 000e 01 4c 0000 0020 007f ffdf 0000 0000",
         ),
         ("0009 0000 0006 01 03 0000 0006", f"0009 0000 000f 01 03 0c {off}"),
-        ("000a 0000 0006 01 4c 00 0af0 02", "000a 0000 0006 01 4c 007f ffff"),  # close: on, so nothing changes
+        (
+            "000a 0000 000a 01 4c 00 0af0 02 00 b462 02",
+            "000a 0000 000a 01 4c 007f ffff 0000 0000",
+        ),  # close: on, so nothing changes
     )
     with Scripted(*exchanges) as server:
         settings = SupplySettings(port=server.address, line=5)
@@ -780,7 +786,7 @@ def test_requests_of_a_high_voltage_supply(bench):
         assert asked(lambda: supply.set(13.0)) == [look, OWNER, send]
         assert asked(lambda: supply.set(0.1)) == [send]
         bench.clock.sleep(0.05)
-        assert asked(supply.safe) == [send, *enable[:-1], look]
+        assert asked(supply.safe) == [send, *enable, look]
         supply.close()
 
 
@@ -1396,7 +1402,6 @@ def test_a_register_is_set_over_another_connection_if_the_former_has_ended(bench
         lambda: sensor._line.send(Target.of(TDAC), 1.0),
         lambda: sensor._line.read_span(Span.of(TEST)),
         lambda: sensor._line.read_packet(Packet.of([Span.of(TEST)])),
-        lambda: sensor._line.read_spans([Span.of(TEST)]),
     ):
         sensor._line._connection.end()
         act()
@@ -1411,10 +1416,8 @@ def test_a_safe_state_does_not_ask_whose_the_instrument_is(bench, in_process):
     packet = Packet.of([Span.of(TEST)])
     with sensor._line.in_haste(unchecked=True):
         assert sensor._line.read_packet(packet) == (0x00112233,)
-        assert sensor._line.read_spans([Span.of(TEST)]) == [[0x00112233]]
-    for read in (lambda: sensor._line.read_packet(packet), lambda: sensor._line.read_spans([Span.of(TEST)])):
-        with pytest.raises(DeviceError, match="another program has taken the LabJack T7"):
-            read()
+    with pytest.raises(DeviceError, match="another program has taken the LabJack T7"):
+        sensor._line.read_packet(packet)
 
 
 def test_every_request_of_a_closed_device_says_so(bench, in_process):
@@ -1429,7 +1432,6 @@ def test_every_request_of_a_closed_device_says_so(bench, in_process):
         lambda: line.send(Target.of(TDAC), 1.0),
         lambda: line.read_span(span),
         lambda: line.read_packet(Packet.of([span])),
-        lambda: line.read_spans([span]),
         lambda: line.play(sensor.conversions, TDAC, np.zeros(2), 100),
     ):
         with pytest.raises(DeviceConnectionError, match="was closed by its device; connect again"):
