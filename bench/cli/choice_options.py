@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         SelectedModel,
         TestedModel,
     )
-    from bench.identification import Candidate
+    from bench.identification import Candidate, Score
 
 # Rows of the printed table; all are in the file.
 _SHOWN = 10
@@ -79,12 +79,9 @@ def _print_table(found: SelectedModel) -> None:
     ]
     usable = [score for score in selection.scores if not score.failure]
     decided = [score for score in usable if score.rows > selection.rows]
-    shown = usable[:_SHOWN]
-    shown += [score for score in (selection.chosen, *decided) if score not in shown]
-    rows = [
-        (
-            "*" if score is selection.chosen else "",
-            _describe(score.candidate),
+
+    def numbers(score: Score) -> tuple[str, ...]:
+        return (
             f"{score.freedom:.1f}",
             significant(factor * score.training, 3),
             significant(factor * score.error, 4),
@@ -92,6 +89,17 @@ def _print_table(found: SelectedModel) -> None:
             significant(factor * score.blocks_rms, 3),
             significant(factor * score.cycles_rms, 3) if score.cycles else "-",
             str(score.rows),
+        )
+
+    # Where the first rows leave no memory, all starts fit alike: one of them stands for the others.
+    distinct = {numbers(score): score for score in (*reversed(usable), selection.chosen)}
+    shown = sorted(distinct.values(), key=usable.index)[:_SHOWN]
+    shown += [score for score in (selection.chosen, *decided) if score not in shown]
+    rows = [
+        (
+            "*" if score is selection.chosen else "",
+            _describe(score.candidate),
+            *numbers(score),
             f"{score.seconds:.1f}",
         )
         for score in shown
@@ -167,7 +175,10 @@ def read_measured(
 def _on_times(found: SelectedModel) -> str:
     """Return what became of the times."""
     if not found.selection.has_times:
-        return "times are not known, so that no lag, creep, drift, viscosity or friction was tried: --time COLUMN"
+        return (
+            "times are not known, so that no lag, creep, drift, viscosity or friction was tried: --time COLUMN names "
+            "them, in a run of the bench --time finished"
+        )
     if found.is_timed:
         return "the chosen model takes the times of the rows; --time none leaves them out"
     return "no lag, creep, drift, viscosity or friction lowers the score: the chosen model takes no times"
