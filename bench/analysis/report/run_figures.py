@@ -50,12 +50,13 @@ def draw_signals(path: Path, run: RecordedRun) -> str:
 def draw_loops(folder: Path, ending: str, run: RecordedRun) -> Iterator[tuple[Path, str]]:
     """Draw the loops of the dashboard's layout, without the resets; yield their files and captions.
 
-    A loop at a fixed rate is one step of many ticks, which are its samples.
+    A loop at a fixed rate is one step of many ticks, which are its samples. A run in which nothing was set, such as a
+    calibration by hand, has no loops.
     """
     steps, summary, found = run.steps, run.summary, run.phases
     samples, over, remark = (steps, "finished", "") if len(steps) > 1 else (summary.shown, "t", summary.remark)
     layout = run.meta.get("dashboard")
-    if not layout or not len(samples):
+    if not layout or not len(samples) or _is_left_alone(run):
         return
     signals = {signal.name: signal for signal in run.record.signals}
     phase = np.searchsorted([each.start for each in found], samples[over], side="right") - 1
@@ -76,6 +77,12 @@ def draw_loops(folder: Path, ending: str, run: RecordedRun) -> Iterator[tuple[Pa
         plot_loops(path, inputs[rows], outputs[rows], input_label=labels[0], output_label=labels[1], phases=named)
         left_out = " Resets are left out." if (known & ~rows).any() else ""
         yield path, f"{ends[1].name} over {ends[0].name}, one point a reading.{left_out} {remark}".rstrip()
+
+
+def _is_left_alone(run: RecordedRun) -> bool:
+    """Return whether a run of several steps has set-points that never change; one that was imported has none."""
+    names = [signal.name for signal in run.record.signals if signal.name.endswith("_setpoint")]
+    return len(run.steps) > 1 and bool(names) and all(np.unique(run.steps[name]).size == 1 for name in names)
 
 
 def _label(signal: Signal) -> str:

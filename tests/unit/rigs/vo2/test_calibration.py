@@ -129,6 +129,10 @@ def test_a_calibrated_rig_and_the_one_message_for_each_calibration_that_does_not
     assert "1999-12-31: overdue" in page.read_text()
 
     run = next(tmp_path.glob("vo2-calibration-mirror-*"))
+    # Nothing was set, so that a curvature over a temperature shows no more than noise.
+    _, out, _ = bench("report", run)
+    assert "signals.png" in out
+    assert "loop.png" not in out
     for options in (("--interval", 365), ("--uncertainty", -1, "--interval", 365), ("--uncertainty", 1)):
         code, _, err = bench("rig", "calibrate", run, "--sensor", "psd_position", "--unit", "°", *options)
         assert code
