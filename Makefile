@@ -143,8 +143,10 @@ twin-trials: $(SETUP)
 	$(BIN)/python tools/twin_trials.py
 
 # The dashboard of every protocol on every emulated rig, dark and light, with those of README.md; fails on an empty view.
+# Then the figures of the tutorials, by their own commands.
 pictures: $(SETUP)
 	$(BIN)/python -P tools/pictures.py --out recordings/pictures --docs
+	$(BIN)/python docs/renew_figures.py
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
