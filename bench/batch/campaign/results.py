@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -21,11 +20,11 @@ from bench.batch.campaign.tasks import ComparisonTask, Done, ModelTask, RunTask,
 
 Cell: TypeAlias = float | int | str | None
 Row: TypeAlias = dict[tuple[str, str], Cell]
-"""Cells by name and unit of their column."""
+"""Cells by name and unit of their column; a table is a sequence of rows, whose columns need not be the same."""
 
 MOST_ROWS = 40
 """Rows of a table that are printed; files have all of them."""
-_NOT_GROUPED = ("steps", "laboratory_time", "wall_time")
+_NOT_GROUPED = ("steps", "laboratory_time", "wall_time", "folder")
 _NOT_SHOWN = ("steps", "wall_time", "folder", "table")
 MEDIAN, WORST, SPREAD = "median", "worst", "spread"
 _PLAIN = ("", "1")
@@ -33,64 +32,53 @@ ERRORS = ("max", "rms")
 """What a comparison gives of each model."""
 
 
-@dataclass(frozen=True)
-class ResultsTable:
-    """Columns of equal length; `None` where a row has no value.
+def columns_of(table: Sequence[Row]) -> dict[tuple[str, str], list[Cell]]:
+    """Return the columns of a table; `None` where a row has no value."""
+    keys = dict.fromkeys(key for row in table for key in row)
+    return {key: [row.get(key) for row in table] for key in keys}
 
-    Attributes
-    ----------
-    columns : mapping of (str, str) to list
-        Cells by name and unit.
-    """
 
-    columns: Mapping[tuple[str, str], Sequence[Cell]]
+def head_of(column: tuple[str, str]) -> str:
+    """Return the head of a column, its unit in brackets."""
+    name, unit = column
+    return header_with_unit(name, "" if unit in _PLAIN else unit)
 
-    @classmethod
-    def of(cls, rows: Sequence[Row]) -> ResultsTable:
-        """Make a table of rows, each a mapping of (name, unit) to a cell."""
-        keys = dict.fromkeys(key for row in rows for key in row)
-        return cls({key: [row.get(key) for row in rows] for key in keys})
 
-    @property
-    def heads(self) -> list[str]:
-        """The heads of the columns, units in brackets."""
-        return [header_with_unit(name, "" if unit in _PLAIN else unit) for name, unit in self.columns]
+def write_table_csv(table: Sequence[Row], path: Path) -> None:
+    """Write a table as CSV; raises DataError if that fails."""
+    columns = columns_of(table).items()
+    write_csv(path, [(head_of(key), ["" if cell is None else cell for cell in cells]) for key, cells in columns])
 
-    def __len__(self) -> int:
-        return len(next(iter(self.columns.values()), ()))
 
-    def write_csv(self, path: Path) -> None:
-        """Write it as CSV; raises DataError if that fails."""
-        columns = [["" if cell is None else cell for cell in cells] for cells in self.columns.values()]
-        write_csv(path, list(zip(self.heads, columns, strict=True)))
+def write_table_parquet(table: Sequence[Row], path: Path) -> None:
+    """Write a table as Parquet, with the unit of each column in its metadata; raises MissingExtraError."""
+    with needed_for("a Parquet file", "report"):
+        import pyarrow as pa
+        import pyarrow.parquet as pq
 
-    def write_parquet(self, path: Path) -> None:
-        """Write it as Parquet, with the unit of each column in its metadata; raises MissingExtraError."""
-        with needed_for("a Parquet file", "report"):
-            import pyarrow as pa
-            import pyarrow.parquet as pq
+    fields, arrays = [], []
+    for key, cells in columns_of(table).items():
+        kinds = {type(cell) for cell in cells if cell is not None}
+        kind = pa.int64() if kinds <= {int} else pa.float64() if kinds <= {int, float} else pa.string()
+        values = cells if kinds <= {int, float} else [None if cell is None else str(cell) for cell in cells]
+        fields.append(pa.field(head_of(key), kind, metadata={"unit": key[1]}))
+        arrays.append(pa.array(values, kind))
+    pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), path)
 
-        fields, arrays = [], []
-        for head, ((_, unit), cells) in zip(self.heads, self.columns.items(), strict=True):
-            kinds = {type(cell) for cell in cells if cell is not None}
-            kind = pa.int64() if kinds <= {int} else pa.float64() if kinds <= {int, float} else pa.string()
-            values = cells if kinds <= {int, float} else [None if cell is None else str(cell) for cell in cells]
-            fields.append(pa.field(head, kind, metadata={"unit": unit}))
-            arrays.append(pa.array(values, kind))
-        pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), path)
 
-    def print(self, title: str, console: Console, most: int = MOST_ROWS) -> None:
-        """Print its first rows."""
-        table = Table(title=title, title_justify="left")
-        for cells, head in zip(self.columns.values(), self.heads, strict=True):
-            # Units stand in brackets, which are no markup; a head breaks between words.
-            justify: Literal["right", "left"] = "right" if _is_numeric(cells) else "left"
-            table.add_column(Text(head.replace("_", " ")), justify=justify, overflow="fold")
-        for row in list(zip(*self.columns.values(), strict=True))[:most]:
-            table.add_row(*(Text(shown(cell)) for cell in row))
-        console.print(table)
-        if len(self) > most:
-            console.print(f"… and {len(self) - most} rows more")
+def print_first_rows(table: Sequence[Row], title: str, console: Console) -> None:
+    """Print the first rows of a table."""
+    printed = Table(title=title, title_justify="left")
+    columns = columns_of(table)
+    for key, cells in columns.items():
+        # Units stand in brackets, which are no markup; a head breaks between words.
+        justify: Literal["right", "left"] = "right" if _is_numeric(cells) else "left"
+        printed.add_column(Text(head_of(key).replace("_", " ")), justify=justify, overflow="fold")
+    for row in table[:MOST_ROWS]:
+        printed.add_row(*(Text(shown(row.get(key))) for key in columns))
+    console.print(printed)
+    if len(table) > MOST_ROWS:
+        console.print(f"… and {len(table) - MOST_ROWS} rows more", highlight=False)
 
 
 def shown(cell: Cell) -> str:
@@ -100,7 +88,7 @@ def shown(cell: Cell) -> str:
     return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
 
 
-def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> ResultsTable:
+def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> list[Row]:
     """Return the runs of one table of a campaign file: what varies, how each ended, and its results."""
     models: dict[str, list[ModelTask]] = {}
     for task in expansion.tasks.values():
@@ -124,25 +112,22 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> Re
             row |= {(f"{model.table}_{name}", unit): value for name, (value, unit) in left.items()}
         row[("folder", "")] = task.name
         rows.append(row)
-    return ResultsTable.of(rows)
+    return rows
 
 
-def over_seeds(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
+def over_seeds(table: Sequence[Row], varying: Sequence[str]) -> list[Row]:
     """Return median, worst (the greatest) and spread of each result over the seeds of a table of runs.
 
     A parameter that is a seed as well, such as `sequence_seed`, counts as one.
     """
-    keys = [key for key in table.columns if key[0] in varying and not key[0].endswith("seed")]
-    names = [key[0] for key in table.columns]
-    results = [
-        key
-        for key in list(table.columns)[names.index("reason") + 1 :]
-        if key[0] not in (*_NOT_GROUPED, "folder") and _is_numeric(table.columns[key])
-    ]
+    columns = columns_of(table)
+    keys = [key for key in columns if key[0] in varying and not key[0].endswith("seed")]
+    after_reason = [*columns][[*columns].index(("reason", "")) + 1 :]
+    results = [key for key in after_reason if key[0] not in _NOT_GROUPED and _is_numeric(columns[key])]
     return _over(table, [("table", ""), *keys], results, "runs")
 
 
-def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
+def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> list[Row]:
     """Return the errors of each model on each run that it was compared on, a row each."""
     rows: list[Row] = []
     for task in expansion.tasks.values():
@@ -154,37 +139,36 @@ def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> Results
                 value, unit = found[f"{model}_{what}"]
                 row[(what, unit)] = value
             rows.append(row)
-    return ResultsTable.of(rows)
+    return rows
 
 
-def over_runs(comparisons: ResultsTable) -> ResultsTable:
+def over_runs(comparisons: Sequence[Row]) -> list[Row]:
     """Return median, worst and spread of the errors of each model over the runs of a `comparisons_table`."""
-    errors = [key for key in comparisons.columns if key[0] in ERRORS]
+    errors = [key for key in columns_of(comparisons) if key[0] in ERRORS]
     return _over(comparisons, [("comparison", ""), ("model", "")], errors, "runs")
 
 
-def shown_columns(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
+def shown_columns(table: Sequence[Row], varying: Sequence[str]) -> list[Row]:
     """Return the columns of a table of runs that people look at: what varies, and results."""
-    alike = [name for name in ("protocol", "rig", "faults", "seed") if name not in varying]
-    columns = {
-        key: cells
-        for key, cells in table.columns.items()
-        if key[0] not in (*_NOT_SHOWN, *alike) and (key[0] != "reason" or any(cells))
-    }
-    return ResultsTable(columns)
+    left_out = {*_NOT_SHOWN, *({"protocol", "rig", "faults", "seed"} - {*varying})}
+    if not any(row[("reason", "")] for row in table):
+        left_out.add("reason")
+    return [{key: cell for key, cell in row.items() if key[0] not in left_out} for row in table]
 
 
-def in_one_cell(summary: ResultsTable) -> ResultsTable:
+def in_one_cell(summary: Sequence[Row]) -> list[Row]:
     """Return a table of `over_seeds` with median and worst in one cell, for people."""
-    columns: dict[tuple[str, str], Sequence[Cell]] = {}
-    for (name, unit), cells in summary.columns.items():
-        result, _, which = name.rpartition(" ")
-        if which == MEDIAN:
-            worst = summary.columns[(f"{result} {WORST}", unit)]
-            columns[(result, unit)] = [f"{shown(a)} / {shown(b)}" for a, b in zip(cells, worst, strict=True)]
-        elif which not in (WORST, SPREAD) and name != "table":
-            columns[(name, unit)] = cells
-    return ResultsTable(columns)
+    rows = []
+    for row in summary:
+        cells: Row = {}
+        for (name, unit), cell in row.items():
+            result, _, which = name.rpartition(" ")
+            if which == MEDIAN:
+                cells[(result, unit)] = f"{shown(cell)} / {shown(row[(f'{result} {WORST}', unit)])}"
+            elif which not in (WORST, SPREAD) and name != "table":
+                cells[(name, unit)] = cell
+        rows.append(cells)
+    return rows
 
 
 def studies_of(expansion: Expansion, done: Mapping[str, Done]) -> dict[str, list[str]]:
@@ -196,109 +180,96 @@ def studies_of(expansion: Expansion, done: Mapping[str, Done]) -> dict[str, list
     return found
 
 
-def studies_table(values: ResultsTable) -> ResultsTable:
-    """Return each number of each study over its seeds, of the `study_values`: median, worst and spread."""
-    return _over(values, [(name, "") for name in ("study", "rig", "number")], [("value", "")], "seeds", named=False)
-
-
-def study_values(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
+def study_values(expansion: Expansion, done: Mapping[str, Done]) -> list[Row]:
     """Return each number of each study and seed, a row each."""
-    return ResultsTable.of(
-        [
-            _without_units(
-                study=task.study,
-                rig=Path(task.rig).stem,
-                seed=task.seed,
-                status=done[task.name].status,
-                number=name,
-                value=value,
-            )
-            for task in expansion.tasks.values()
-            if isinstance(task, StudyTask)
-            for name, (value, _) in done[task.name].results.items()
-        ]
-    )
+    return [
+        _without_units(
+            study=task.study,
+            rig=Path(task.rig).stem,
+            seed=task.seed,
+            status=done[task.name].status,
+            number=name,
+            value=value,
+        )
+        for task in expansion.tasks.values()
+        if isinstance(task, StudyTask)
+        for name, (value, _) in done[task.name].results.items()
+    ]
 
 
 def show_results(expansion: Expansion, done: Mapping[str, Done], folder: Path, console: Console) -> list[Path]:
     """Print the tables of a campaign and write them to files in its folder; return these."""
-    summaries: dict[str, ResultsTable] = {}
-    tables = {name: runs_table(expansion, done, name) for name in expansion.varying}
-    for name, table in tables.items():
-        shown_columns(table, expansion.varying[name]).print(name, console)
-        if "seed" in expansion.varying[name]:
-            summaries[name] = over_seeds(table, expansion.varying[name])
-            in_one_cell(summaries[name]).print(f"{name}: median / worst over the seeds", console)
-    files = {"results": together(tables.values())} if tables else {}
-    if summaries:
-        files["summary"] = together(summaries.values())
-    comparisons = comparisons_table(expansion, done)
-    if len(comparisons):
+    results: list[Row] = []
+    summary: list[Row] = []
+    for name, varying in expansion.varying.items():
+        table = runs_table(expansion, done, name)
+        print_first_rows(shown_columns(table, varying), name, console)
+        results += table
+        if "seed" in varying:
+            of_seeds = over_seeds(table, varying)
+            print_first_rows(in_one_cell(of_seeds), f"{name}: median / worst over the seeds", console)
+            summary += of_seeds
+    files = {"results": results, "summary": summary}
+    if comparisons := comparisons_table(expansion, done):
         compared = over_runs(comparisons)
-        compared.print("comparisons, over the runs", console)
+        print_first_rows(compared, "comparisons, over the runs", console)
         files |= {"comparisons": comparisons, "comparisons-summary": compared}
-    values = study_values(expansion, done)
-    if len(values):
+    if values := study_values(expansion, done):
         texts = [
             print_over_seeds(name, [folder / task for task in tasks], console)
             for name, tasks in studies_of(expansion, done).items()
         ]
         write_result(folder / MARKDOWN_NAME, "\n\n".join(texts) + "\n")
         print_plain(console, f"every number: {folder / 'studies.csv'}")
-        files |= {"studies": studies_table(values), "study-values": values}
-    return write_tables(files, folder, console)
+        keys = [(name, "") for name in ("study", "rig", "number")]
+        files |= {"studies": _over(values, keys, [("value", "")], "seeds", named=False), "study-values": values}
+    return write_tables({name: table for name, table in files.items() if table}, folder, console)
 
 
-def write_tables(tables: Mapping[str, ResultsTable], folder: Path, console: Console) -> list[Path]:
+def write_tables(tables: Mapping[str, Sequence[Row]], folder: Path, console: Console) -> list[Path]:
     """Write tables as CSV and Parquet files by their name; without pyarrow as CSV only, which is said once."""
     paths = []
     for name, table in tables.items():
         paths.append(folder / f"{name}.csv")
-        table.write_csv(paths[-1])
+        write_table_csv(table, paths[-1])
     try:
         for name, table in tables.items():
-            table.write_parquet(folder / f"{name}.parquet")
+            write_table_parquet(table, folder / f"{name}.parquet")
             paths.append(folder / f"{name}.parquet")
     except MissingExtraError as error:
         print_plain(console, f"no Parquet files: {error}")
     return paths
 
 
-def together(tables: Iterable[ResultsTable]) -> ResultsTable:
-    """Return the rows of several tables in one; what varies in one of them is empty in the others."""
-    rows = [{key: cells[i] for key, cells in table.columns.items()} for table in tables for i in range(len(table))]
-    return ResultsTable.of(rows)
-
-
 def _over(
-    table: ResultsTable,
+    table: Sequence[Row],
     keys: Sequence[tuple[str, str]],
     results: Sequence[tuple[str, str]],
     count: str,
     *,
     named: bool = True,
-) -> ResultsTable:
+) -> list[Row]:
     """Return median, worst (the greatest) and spread of results over the rows that have the same cells elsewhere.
 
     `keys` are the other columns, and `count` is the head of the number of rows. Heads begin with the name of a result
     if there are several.
     """
-    groups: dict[tuple[Cell, ...], list[int]] = {}
-    for i, cells in enumerate(zip(*(table.columns[key] for key in keys), strict=True)):
-        groups.setdefault(cells, []).append(i)
+    groups: dict[tuple[Cell, ...], list[Row]] = {}
+    for each in table:
+        groups.setdefault(tuple(each.get(key) for key in keys), []).append(each)
     rows: list[Row] = []
     for group, members in groups.items():
         row = dict(zip(keys, group, strict=True)) | _without_units(**{count: len(members)})
-        if count == "runs" and (statuses := table.columns.get(("status", ""))):
-            row |= _without_units(completed=sum(statuses[i] == "completed" for i in members))
+        if count == "runs" and any(("status", "") in each for each in members):
+            row |= _without_units(completed=sum(each[("status", "")] == "completed" for each in members))
         for name, unit in results:
-            values = _numbers(table.columns[(name, unit)][i] for i in members)
+            values = _numbers(each.get((name, unit)) for each in members)
             prefix = f"{name} " if named else ""
             row[(f"{prefix}{MEDIAN}", unit)] = statistics.median(values) if values else None
             row[(f"{prefix}{WORST}", unit)] = max(values, key=abs) if values else None
             row[(f"{prefix}{SPREAD}", unit)] = max(values) - min(values) if values else None
         rows.append(row)
-    return ResultsTable.of(rows)
+    return rows
 
 
 def _without_units(**cells: Cell) -> Row:
