@@ -21,7 +21,8 @@ from typer.main import get_command
 
 from bench.base import VirtualClock, registry
 from bench.batch.campaign.file import ComparisonsTable, ModelsTable, RunsTable, StudiesTable
-from bench.cli import EXIT_CODES, Catalogue, app
+from bench.cli import EXIT_CODES, app
+from bench.protocol import packaged_protocols
 from bench.record import rows
 from bench.rig import (
     LONGEST_TURN,
@@ -230,7 +231,7 @@ def protocols() -> Iterator[str]:
     yield "# Protocols\n"
     yield "`bench run PROTOCOL --rig RIG --set NAME=VALUE`. A default that comes from a slot is that of the rig:"
     yield "`bench run PROTOCOL --rig RIG --help` shows it.\n"
-    for name, one in Catalogue.of_installed().protocols.items():
+    for name, one in packaged_protocols().protocols.items():
         yield f"## `{name}`\n"
         yield f"{_paragraphs(one.description)}\n"
         if one.slots:

@@ -30,7 +30,7 @@ from rerun.chunk import RrdReader
 
 import bench
 from bench.base import DataError, WallClock
-from bench.cli import Catalogue
+from bench.cli import installed
 from bench.dashboard import rebuild
 from bench.dashboard.rerun_recording import LOOPBACK, free_port
 from bench.dashboard.screenshot import MENU_BAR, Camera
@@ -331,9 +331,8 @@ def _colours(png: bytes) -> int:
 
 def every_picture(only: str) -> list[Wanted]:
     """Return the pictures to draw: all protocols on all emulated rigs, then those of the documents."""
-    catalogue = Catalogue.of_installed()
-    rigs = [rig for rig in catalogue.rigs if load_rig(rig).emulated]
-    pictures = [Wanted(f"{rig}-{protocol}", rig, protocol) for rig in rigs for protocol in catalogue.fitting(rig)]
+    fitting = {rig: protocols for rig, protocols in installed()["fitting"].items() if load_rig(rig).emulated}
+    pictures = [Wanted(f"{rig}-{protocol}", rig, protocol) for rig in fitting for protocol in fitting[rig]]
     pictures += [Wanted(name, *what) for name, what in README.items()]
     return [each for each in pictures if only in each.name]
 

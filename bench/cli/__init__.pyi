@@ -4,7 +4,7 @@ from .application import (
     main as main,
 )
 from .catalogue import (
-    Catalogue as Catalogue,
+    installed as installed,
 )
 from .command_support import (
     STANDARD_OUTPUT as STANDARD_OUTPUT,

@@ -17,31 +17,27 @@ from bench.base import json_text, parse_json, registry, write_whole
 
 
 def listing() -> dict[str, Any]:
-    """Return the installed catalogue, as `bench.cli.catalogue.Catalogue.to_json`.
+    """Return the installed catalogue, as `bench.cli.catalogue.installed`.
 
     It is remembered in the user's folder for caches, unless something could not be loaded.
     """
     state = _state()
-    file = _file_of_this_environment()
+    # Another environment has another listing, which shall not take the place of this one's.
+    file = _folder() / f"catalogue-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:12]}.json"
     with suppress(OSError, ValueError):
         remembered = parse_json(file.read_text(encoding="utf-8"))
         if isinstance(remembered, dict) and remembered.get("state") == state:
             found: dict[str, Any] = remembered["catalogue"]
             return found
-    from bench.cli.catalogue import Catalogue
+    from bench.cli import catalogue
 
-    found = Catalogue.of_installed().to_json()
+    found = catalogue.installed()
     if not found["problems"]:
         # Where nothing can be remembered, it is said again each time.
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
             write_whole(file, json_text({"state": state, "catalogue": found}))
     return found
-
-
-def _file_of_this_environment() -> Path:
-    # Another environment has another listing, which shall not take the place of this one's.
-    return _folder() / f"catalogue-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:12]}.json"
 
 
 def _folder() -> Path:

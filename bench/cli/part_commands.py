@@ -41,32 +41,35 @@ def show(
     A protocol is shown with its parameters, a rig with its file: `bench show RIG > desk.toml` gives you a copy to
     fill in.
     """
-    from bench.cli.catalogue import Catalogue
     from bench.cli.model_options import print_model, print_models
     from bench.cli.run_commands import print_protocol
     from bench.models import identifiable_models, timed_models
+    from bench.protocol import find_protocol
+    from bench.rig import load_rig
 
-    catalogue = Catalogue.of_installed()
-    if name in catalogue.rigs:
+    listed = listing()
+    specs = identifiable_models() | timed_models()
+    others = {**listed["studies"], **listed["controllers"]}
+    if name in listed["rigs"]:
         # Plain, so that it can be redirected into a file.
-        typer.echo(catalogue.rigs[name].text, nl=False, err=console.stderr)
-        write_json(json_file, {"name": name, "text": catalogue.rigs[name].text})
-    elif name in catalogue.protocols:
-        definition = catalogue.protocols[name]
+        text = load_rig(name).text
+        typer.echo(text, nl=False, err=console.stderr)
+        write_json(json_file, {"name": name, "text": text})
+    elif name in listed["protocols"]:
+        definition = find_protocol(name)
         print_protocol(definition)
         write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in definition.help()]})
     elif name == "models":
-        specs = identifiable_models() | timed_models()
         print_models(specs)
         write_json(json_file, {each: _model_json(spec) for each, spec in specs.items()})
-    elif name in (specs := identifiable_models() | timed_models()):
+    elif name in specs:
         print_model(specs[name])
         write_json(json_file, {"name": name, **_model_json(specs[name])})
-    elif name in (others := {**catalogue.studies, **catalogue.controllers}):
+    elif name in others:
         console.print(others[name])
         write_json(json_file, {"name": name, "summary": others[name]})
     else:
-        known = closest(name, [*catalogue.rigs, *catalogue.protocols, *specs, *others], "`bench list`")
+        known = closest(name, [*listed["rigs"], *listed["protocols"], *specs, *others], "`bench list`")
         raise ConfigurationError(f"there is no rig, protocol, model, controller or study {name!r}; {known}")
 
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from bench.base import registry
-from bench.cli import Catalogue, listing
+from bench.cli import catalogue, listing
 
 
 @pytest.fixture
@@ -16,8 +16,8 @@ def made(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "cache"))
     count = []
-    of_installed = Catalogue.of_installed
-    monkeypatch.setattr(Catalogue, "of_installed", lambda: count.append(1) or of_installed())
+    installed = catalogue.installed
+    monkeypatch.setattr(catalogue, "installed", lambda: count.append(1) or installed())
     return count
 
 
@@ -44,7 +44,7 @@ def test_is_the_catalogue_and_made_once(made):
     assert len(made) == 1
     assert listing.listing() == first
     assert len(made) == 1
-    assert first == json.loads(json.dumps(Catalogue.of_installed().to_json()))
+    assert first == json.loads(json.dumps(catalogue.installed()))
 
 
 def test_is_made_anew_after_a_change_of_a_file(made, outside):
