@@ -82,19 +82,22 @@ def show_table(console: Console, table: Table) -> None:
 def print_table(
     console: Console,
     heads: Sequence[str],
-    rows: Iterable[Sequence[str]],
+    rows: Iterable[Sequence[str | Text]],
     title: str = "",
     *,
     numbers_from: int = 99,
     framed: bool = True,
 ) -> None:
-    """Print a table of plain texts, see `show_table`; the columns from `numbers_from` on are aligned right."""
+    """Print a table of plain texts, see `show_table`; a `Text` has a style of its own.
+
+    The columns from `numbers_from` on are aligned right.
+    """
     look: dict[str, Any] = {} if framed else {"box": None, "padding": (0, 2)}
     table = Table(title=title and Text(title), title_justify="left", **look)
     for i, head in enumerate(heads):
         table.add_column(Text(head), justify="left" if i < numbers_from else "right")
     for row in rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     show_table(console, table)
 
 

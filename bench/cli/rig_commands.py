@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
-from bench.base import AbortError, ConfigurationError, DeviceError, counted, print_plain, show_table, wall_time
+from bench.base import AbortError, ConfigurationError, DeviceError, counted, print_plain, print_table, wall_time
 from bench.cli.command_support import (
     UNSAFE_EXIT_CODE,
     AttachOption,
@@ -26,6 +25,9 @@ from bench.cli.command_support import (
 )
 from bench.cli.printing import console, print_rows, show_compilation, warn
 from bench.cli.run_names import NEWEST, RunArgument
+
+if TYPE_CHECKING:
+    from bench.rig import Condition
 
 RigArgument = Annotated[
     str,
@@ -76,12 +78,15 @@ def safe(
                     warn(f"{name}: NOT CONFIRMED: {each.state}; {each.advice}")
             if unsafe and seconds >= 1.0:
                 warn(f"not confirmed after {seconds:.0f} s: {', '.join(unsafe)}; trying again, Ctrl-C ends")
-    table = Table("device", "state", "what to do", box=None, padding=(0, 2))
-    for each in found:
-        style = "green" if each.is_safe else "bold red"
-        state = each.state if each.is_safe else f"NOT CONFIRMED: {each.state}"
-        table.add_row(each.device, Text(state, style), each.advice)
-    show_table(console, table)
+    rows = [
+        (
+            each.device,
+            Text(each.state, "green") if each.is_safe else Text(f"NOT CONFIRMED: {each.state}", "bold red"),
+            each.advice,
+        )
+        for each in found
+    ]
+    print_table(console, ("device", "state", "what to do"), rows, framed=False)
     write_json(json_file, {each.device: {"state": each.state, "is_safe": each.is_safe} for each in found})
     if not all(each.is_safe for each in found):
         sys.exit(UNSAFE_EXIT_CODE)
@@ -107,13 +112,13 @@ def clear(
     Exit codes: 0 every device is ready; 2 the rig file is wrong or does not fit an instrument, or the rig is in use;
     4 a device is still in error, or cannot be reached; 130 not confirmed.
     """
-    from bench.rig import Condition, load_rig, look, opened, recover
+    from bench.rig import load_rig, look, opened, recover
 
     file = load_rig(rig, parse_assignments("--override", overrides or []))
     with opened(file, attach, "bench rig clear") as place:
         entries = place.only(device)
         found: dict[str, Condition] = {entry.name: look(place, entry) for entry in entries}
-        _print_conditions(list(found.values()))
+        _print_conditions(found.values())
         wanted = [entry for entry in entries if (at := found[entry.name]).state == "in error" and at.can_recover]
         if wanted:
             names = ", ".join(entry.name for entry in wanted)
@@ -133,15 +138,12 @@ def clear(
             raise DeviceError(each.device, f"is {each.state}: {each.meaning}")
 
 
-def _print_conditions(conditions: Sequence[object]) -> None:
-    from bench.rig import Condition
-
-    table = Table("device", "state", "what it is, or what it reports", box=None, padding=(0, 2))
-    for each in conditions:
-        assert isinstance(each, Condition)
-        style = "green" if each.state == "ready" else "bold red"
-        table.add_row(each.device, Text(each.state, style), each.meaning)
-    show_table(console, table)
+def _print_conditions(conditions: Iterable[Condition]) -> None:
+    rows = [
+        (each.device, Text(each.state, "green" if each.state == "ready" else "bold red"), each.meaning)
+        for each in conditions
+    ]
+    print_table(console, ("device", "state", "what it is, or what it reports"), rows, framed=False)
 
 
 @show_compilation()
@@ -190,10 +192,11 @@ def check(
         for check in checks
         for finding in (*([CheckFinding("instrument", check.identity)] if check.identity else ()), *check.findings)
     ]
-    table = Table(*heads, box=None, padding=(0, 2))
-    for device, what, text, advice in rows:
-        table.add_row(Text(device, "bold"), what, Text(text, "yellow" if advice else ""), advice)
-    show_table(console, table)
+    styled = [
+        (Text(device, "bold"), what, Text(text, "yellow" if advice else "default"), advice)
+        for device, what, text, advice in rows
+    ]
+    print_table(console, heads, styled, framed=False)
     code = 0
     if any(finding.advice for check in checks for finding in check.findings):
         code = 1
@@ -203,7 +206,7 @@ def check(
         code = UNSAFE_EXIT_CODE
     count = sum(bool(finding.advice) for check in checks for finding in check.findings)
     verdict = f"{count} to look at" if count else "all is well"
-    console.print(verdict)
+    console.print(verdict, highlight=False)
     if html is not None:
         from bench.analysis import Page, PageSection, PageTable, write_page
 

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from bench.base import ConfigurationError, show_table, write_whole
+from bench.base import ConfigurationError, print_table, write_whole
 from bench.cli import JsonOption, console, parse_assignments, write_json
 
 
@@ -69,20 +68,18 @@ def find(
         own = (port_of(entry.settings) for entry in askable(file))
         asked = [port for port in own if not port.startswith((EMULATED, "visa://"))]
     known = ports([*(further or []), *asked], hosts or [], search=attach is None)
-    table = Table("port", "description", "USB serial number", "remark", box=None, padding=(0, 2))
-    for each in known:
-        table.add_row(each.name, each.description, each.serial_number, each.problem)
-    show_table(console, table)
+    rows = [(each.name, each.description, each.serial_number, each.problem) for each in known]
+    print_table(console, ("port", "description", "USB serial number", "remark"), rows, framed=False)
     if rig is None or file is None:
         write_json(json_file, {"ports": [asdict(each) for each in known], "devices": {}})
         return
     placed = placements(file, answers(file, known), known)
-    table = Table("device", "port", "instrument", "remark", box=None, padding=(0, 2))
-    for one in placed:
-        port, identity = ("–", "–") if one.answer is None else (one.answer.port.name, str(one.answer.identity))
-        table.add_row(one.device, port, identity, one.remark)
+    places = [
+        ("–", "–") if one.answer is None else (one.answer.port.name, str(one.answer.identity)) for one in placed
+    ]
+    rows = [(one.device, *place, one.remark) for one, place in zip(placed, places, strict=True)]
     console.print()
-    show_table(console, table)
+    print_table(console, ("device", "port", "instrument", "remark"), rows, framed=False)
     if write:
         found = zip(placed, askable(file), strict=True)
         _write(Path(rig), [keys_of(entry, one.answer) for one, entry in found if one.answer])
@@ -108,4 +105,4 @@ def _write(path: Path, found: Iterable[Mapping[tuple[str, str], Mapping[str, Any
                 for key in keys.keys() & device.keys() if device.get("line") == name else ():
                     del device[key]
     write_whole(path, tomlkit.dumps(document))
-    console.print(f"written: {path}")
+    console.print(f"written: {path}", highlight=False)
