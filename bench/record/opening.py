@@ -6,12 +6,12 @@ import os
 import shutil
 import sqlite3
 import tempfile
+from contextlib import closing
 from itertools import chain
 from pathlib import Path
 
 from bench.base import DataError
 from bench.record.finding import cause_of, way_back
-from bench.record.rows import NUMBERS, Row
 from bench.record.second_file import places, read_second_file
 from bench.record.store import insert
 
@@ -69,21 +69,17 @@ class OpenedJournal:
     def take_in(self, identity: str) -> str:
         """Have the rows that only a second file has read like those of the journal; return what is to be said of it.
 
-        Temporary views stand before the tables then. Raises `sqlite3.Error` if they are no rows of these tables.
+        A temporary copy of the journal takes them then. Raises `sqlite3.Error` if they are no rows of its tables.
         """
         rows = {place: [*read_second_file(place, identity)] for place in places(self.path)}
-        keys = {"meta": "key", **NUMBERS}
-        count = 0
-        for table, key in keys.items() if any(rows.values()) else ():
-            waiting = f"waiting_{table}"
-            both = f"SELECT * FROM main.{table} UNION ALL SELECT * FROM {waiting}"  # noqa: S608
-            self.db.execute(f"CREATE TEMP TABLE {waiting} AS SELECT * FROM main.{table} LIMIT 0")  # noqa: S608
-            self.db.execute(f"CREATE UNIQUE INDEX temp.keys_of_{table} ON {waiting} ({key})")
-            insert(self.db, (Row(waiting, row.columns) for row in chain(*rows.values()) if row.table == table))
-            self.db.execute(f"DELETE FROM {waiting} WHERE {key} IN (SELECT {key} FROM main.{table})")  # noqa: S608
-            count += self.db.execute(f"SELECT count(*) FROM {waiting}").fetchone()[0]  # noqa: S608
-            self.db.execute(f"CREATE TEMP VIEW {table} AS {both}")
-        if not count:
+        if not any(rows.values()):
+            return ""
+        with closing(self.db) as own:
+            self.db = sqlite3.connect("", isolation_level=None)
+            own.backup(self.db)
+        before = self.db.total_changes
+        insert(self.db, chain(*rows.values()), otherwise="IGNORE")
+        if not (count := self.db.total_changes - before):
             return ""
         where = " and ".join(str(place) for place, found in rows.items() if found)
         return (

@@ -101,6 +101,7 @@ class Record:
             said = self._opened.take_in(self.identity)
         except sqlite3.Error as error:
             raise self._damaged(f"its second file does not fit: {error}") from error
+        self._db = self._opened.db
         if said:
             self._read_heading()
         return said
@@ -282,19 +283,7 @@ class Record:
 
     def _blocks(self, table: str, after: int = -1) -> Iterator[list[tuple[Any, ...]]]:
         """Yield the rows with numbers beyond `after` in blocks."""
-        # Columns by name, as only then a missing one is an error.
-        leading = {
-            "steps": ("step", "started", "finished", "phase", "label", "settled", "setpoints"),
-            "telemetry": ("tick", "t", "step"),
-            "events": ("event", "t", "level", "kind", "text"),
-        }[table]
-        signals = () if table == "events" else tuple(signal.name for signal in self.signals)
-        seen = ("seen",) if table == "steps" else ()
-        names = (*leading, *signals, *seen, "checksum")
-        columns = ", ".join(map(quoted, names))
-        # The rows are numbered by their first column, from 0 or 1.
-        first = leading[0]
-        statement = f"SELECT {columns} FROM {table} WHERE {first} > {after:d} ORDER BY 1"  # noqa: S608 - own names
+        statement = f"SELECT * FROM {table} WHERE {NUMBERS[table]} > {after:d} ORDER BY 1"  # noqa: S608 - own names
         try:
             cursor = self._db.execute(statement)
             while rows := cursor.fetchmany(_BLOCK):
