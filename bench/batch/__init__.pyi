@@ -7,7 +7,6 @@ from .campaign.execution import (
     WorkersExecutor as WorkersExecutor,
     carry_out_tasks as carry_out_tasks,
     done_before as done_before,
-    holder as holder,
     opened_folder as opened_folder,
 )
 from .campaign.expansion import (
@@ -20,7 +19,6 @@ from .campaign.results import (
     show_results as show_results,
 )
 from .campaign.tasks import (
-    UNFINISHED as UNFINISHED,
     CampaignTask as CampaignTask,
     Done as Done,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -120,17 +119,14 @@ def campaign(
     """
     from bench.base import Stopwatch, Workers, available_cores
     from bench.batch import (
-        UNFINISHED,
         WorkersExecutor,
         carry_out_tasks,
         done_before,
         expand,
-        holder,
         opened_folder,
         read_campaign,
         show_results,
     )
-    from bench.rig import Locks
 
     stopwatch = Stopwatch()
     check_outputs(json_file=json_file, folder=out, read=[file])
@@ -150,7 +146,7 @@ def campaign(
         return
     with ExitStack() as stack:
         stack.enter_context(_saying_how_to_go_on(folder))
-        opened_folder(folder, file.read_text(encoding="utf-8-sig"), stack.enter_context(Locks(holder(folder))))
+        stack.enter_context(opened_folder(folder, file.read_text(encoding="utf-8-sig")))
         # Another process may have been at work here until it was locked.
         before = done_before(expansion.tasks, folder)
         for line in before.put_in_place(folder):
@@ -168,7 +164,6 @@ def campaign(
             already = len(before.done)
             stack.enter_context(_saying_how_far(lambda: len(done) - already, len(expansion.tasks) - already))
         done = carry_out_tasks(expansion.tasks, done, executor)
-        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     files = show_results(expansion, done, folder, console)
     failed = {name: each for name, each in done.items() if not each.carried_out}
     for name, each in failed.items():

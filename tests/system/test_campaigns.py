@@ -15,7 +15,6 @@ from rich.console import Console
 
 from bench.base import ConfigurationError, Workers, registry
 from bench.batch import (
-    UNFINISHED,
     ClusterExecutor,
     ResultTable,
     Study,
@@ -29,11 +28,10 @@ from bench.batch import (
     read_campaign,
 )
 from bench.batch.campaign.study_tables import OverSeeds, over_seeds
-from bench.batch.campaign.tasks import DONE_NAME
+from bench.batch.campaign.tasks import DONE_NAME, UNFINISHED
 from bench.cli import main
 from bench.execution import carry_out
 from bench.record import Record
-from bench.rig import Holder, Locks
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 
@@ -357,8 +355,7 @@ class TestTasks:
 
     def test_one_process_at_a_time_works_in_a_folder(self, campaign, tmp_path, capsys):
         path, out = campaign(STAIRS), tmp_path / "out"
-        with Locks(Holder.of_this_process("emulated", "the other")) as locks:
-            opened_folder(out, "", locks)
+        with opened_folder(out, ""):
             assert start(path, "--out", out, "--workers", 1) == 2
         assert "out is in use: " in capsys.readouterr().err
 

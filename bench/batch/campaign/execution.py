@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -65,23 +66,22 @@ def settled(task: CampaignTask, error: BaseException | None, done: Done | None) 
     return Done(task.identity, "crashed", f"{type(error).__name__}: {error}")
 
 
-def opened_folder(campaign: Path, text: str, locks: Locks) -> None:
-    """Make the folder of a campaign ready, for one process at a time; what others left unfinished is removed.
+@contextmanager
+def opened_folder(campaign: Path, text: str) -> Iterator[None]:
+    """Hold the folder of a campaign meanwhile, for one process at a time; what is unfinished is removed.
 
     Raises ConfigurationError if another campaign is at work in it, or it cannot be written.
     """
-    try:
-        campaign.mkdir(parents=True, exist_ok=True)
-        locks.take_folder(campaign)
+    with Locks(Holder.of_this_process("emulated", f"a campaign in {campaign.resolve()}")) as locks:
+        try:
+            campaign.mkdir(parents=True, exist_ok=True)
+            locks.take_folder(campaign)
+            shutil.rmtree(campaign / UNFINISHED, ignore_errors=True)
+            (campaign / FILE_NAME).write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigurationError(f"the folder of the campaign cannot be made: {error}") from None
+        yield
         shutil.rmtree(campaign / UNFINISHED, ignore_errors=True)
-        (campaign / FILE_NAME).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"the folder of the campaign cannot be made: {error}") from None
-
-
-def holder(campaign: Path) -> Holder:
-    """Return who holds the folder of a campaign, for others."""
-    return Holder.of_this_process("emulated", f"a campaign in {campaign.resolve()}")
 
 
 @dataclass(frozen=True)

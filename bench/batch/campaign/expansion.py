@@ -7,9 +7,10 @@ import math
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -133,7 +134,6 @@ class _Expander:
         self._tasks: dict[str, CampaignTask] = {}
         self._runs: dict[str, list[_Run]] = {}
         self._models: dict[str, dict[tuple[str, int], list[ModelTask]]] = {}
-        self._several: dict[str, bool] = {}
         self._found_plans: dict[str, tuple[float, float]] = {}
         self._varying: dict[str, tuple[str, ...]] = {}
         self._units: dict[tuple[str, str], str] = {}
@@ -180,10 +180,7 @@ class _Expander:
         where = self._file.where("models", number)
         known = {runs.label: runs for runs in self._file.tables.runs}
         for name in table.runs:
-            if name not in known:
-                raise ConfigurationError(
-                    f"{where}: runs = {name!r}: there is no table of runs of this name; {closest(name, known)}"
-                )
+            _check_known(f"{where}: runs", name, known, "table of runs of this name")
             seeds = known[name].seeds
             if table.seed is not None and table.seed not in seeds:
                 raise ConfigurationError(
@@ -222,7 +219,7 @@ class _Expander:
             "protocol": len(table.protocol) > 1,
             "rig": len(table.rigs) > 1,
             **{key: len(values) > 1 for key, values in {**parameters, **overrides}.items()},
-            **{key: True for key, names in models.items() if len(names) > 1 or self._several[names[0]]},
+            **{key: True for key, names in models.items() if len(names) > 1 or self._has_several(names[0])},
             "faults": len(table.faults) > 1,
             "seed": len(table.seeds) > 1,
         }
@@ -235,16 +232,17 @@ class _Expander:
                 for chosen in _grid(parameters):
                     self._add_run_of(where, table, protocol, rig, known, replaced, chosen, models)
 
+    def _has_several(self, models: str) -> bool:
+        """Return whether a table of models has several of a rig and seed."""
+        return any(len(each) > 1 for each in self._models[models].values())
+
     def _references(self, where: str, key: str, values: Sequence[Any]) -> list[str]:
         """Return the tables of models to which the values of a parameter refer."""
         names = [value[1:] for value in values if isinstance(value, str) and value.startswith(REFERENCE)]
+        known = [REFERENCE + each for each in self._models]
         for name in names:
-            if name not in self._models:
-                known = closest(REFERENCE + name, [REFERENCE + each for each in self._models])
-                raise ConfigurationError(
-                    f"{where}: parameters.{key} = '{REFERENCE}{name}': there is no such table of models of runs that "
-                    f"come before; {known}"
-                )
+            what = "such table of models of runs that come before"
+            _check_known(f"{where}: parameters.{key}", REFERENCE + name, known, what)
         return names
 
     def _add_run_of(
@@ -260,11 +258,12 @@ class _Expander:
     ) -> None:
         """Add the runs of one point of the grid: its faults, seeds, and the models of each."""
         definition, source = self._protocol(where, protocol)
+        referred = {key: str(chosen[key])[1:] for key in models if str(chosen[key]).startswith(REFERENCE)}
         given = {
-            key: self._file.beside(value) if key in definition.file_parameters and _is_path(value) else value
+            key: self._file.beside(value) if key in definition.file_parameters and isinstance(value, str) else value
             for key, value in chosen.items()
+            if key not in referred
         }
-        referred = {key: str(given.pop(key))[1:] for key in models if str(given[key]).startswith(REFERENCE)}
         planned, resolved, inputs = self._planned(where, definition, source, known, given, referred)
         for key in chosen:
             self._units.setdefault((table.label, key), _unit(definition, known.file, key))
@@ -341,7 +340,6 @@ class _Expander:
         self._models[table.name] = {}
         runs = [run for label in table.runs for run in self._runs[label] if table.seed in (None, run.task.seed)]
         if (whole := whole_identification(table.model)) is not None:
-            self._several[table.name] = False
             for key in dict.fromkeys((run.rig, run.task.seed) for run in runs):
                 together = [run for run in runs if (run.rig, run.task.seed) == key]
                 self._check_whole(where, whole, *key, together)
@@ -349,7 +347,6 @@ class _Expander:
             return
         (table_of_runs,) = table.runs
         varying = [key for key in self._varying[table_of_runs] if key not in ("rig", "seed")]
-        self._several[table.name] = bool(varying)
         for run in runs:
             self._check_identification(where, table, run)
             label = " ".join([table.name, *(f"{key}={_shown(run.task.setting(key))}" for key in varying)])
@@ -393,9 +390,8 @@ class _Expander:
         for key, (column, slot) in columns.items():
             if not column and slot not in slots:
                 raise ConfigurationError(f"{where}: {key} is missing, as {run.task.protocol} has no slot {slot!r}")
-            if column and column not in known.description.by_name:
-                signals = closest(column, known.description.by_name)
-                raise ConfigurationError(f"{where}: {key} = {column!r}: there is no such signal; {signals}")
+            if column:
+                _check_known(f"{where}: {key}", column, known.description.by_name, "such signal")
         drive = known.file.roles.get("drive")
         if table.input or drive is None or drive.range is None:
             return
@@ -413,10 +409,7 @@ class _Expander:
             ("models", table.models, self._models),
         ):
             for name in names:
-                if name not in known:
-                    raise ConfigurationError(
-                        f"{where}: {key} = {name!r}: there is no table of {key} of this name; {closest(name, known)}"
-                    )
+                _check_known(f"{where}: {key}", name, known, f"table of {key} of this name")
         tables = {models.name: models for models in self._file.tables.models}
         columns = {(tables[name].input, tables[name].output) for name in table.models}
         if len(columns) > 1:
@@ -446,10 +439,8 @@ class _Expander:
 
     def _add_studies(self, number: int, table: Any) -> None:  # noqa: ANN401 - a StudiesTable
         where = self._file.where("studies", number)
-        try:
+        with _said_at(f"{where}: name = {table.name!r}"):
             study: Study = registry.load("studies", table.name)
-        except ConfigurationError as error:
-            raise ConfigurationError(f"{where}: name = {table.name!r}: {error}") from None
         for rig, seed in itertools.product(table.rigs, table.seeds):
             given = self._file.beside(rig) if rig.endswith(".toml") else rig
             if rig and study.rig is None:
@@ -471,10 +462,8 @@ class _Expander:
         """Return a protocol, and the hash of its file."""
         if name not in self._protocols:
             path = self._file.beside(name) if ".py" in name else name
-            try:
+            with _said_at(f"{where}: protocol = {name!r}"):
                 definition = find_protocol(path)
-            except ConfigurationError as error:
-                raise ConfigurationError(f"{where}: protocol = {name!r}: {error}") from None
             source = file_digest(Path(path.partition(".py")[0] + ".py"), PROGRAMS) if ".py" in name else ""
             self._protocols[name] = definition, source
         return self._protocols[name]
@@ -482,23 +471,18 @@ class _Expander:
     def _rig(self, where: str, name: str, overrides: Mapping[str, str]) -> KnownRig:
         key = name, digest(overrides)
         if key not in self._rigs:
-            try:
+            with_overrides = f" with overrides {dict(overrides)}" if overrides else ""
+            with _said_at(f"{where}: rigs = {name!r}{with_overrides}"):
                 path = self._file.beside(name) if name.endswith(".toml") else name
                 self._rigs[key] = KnownRig.look_at(path, overrides)
-            except BenchError as error:
-                with_overrides = f" with overrides {dict(overrides)}" if overrides else ""
-                raise ConfigurationError(f"{where}: rigs = {name!r}{with_overrides}: {error}") from None
         return self._rigs[key]
 
     def _check_faults(self, where: str, known: KnownRig, faults: str) -> None:
         key = known.digest, faults
-        if key in self._faults:
-            return
-        try:
-            known.check_faults(Path(self._file.beside(faults)))
-        except ConfigurationError as error:
-            raise ConfigurationError(f"{where}: faults = {faults!r}, rig {known.file.name}: {error}") from None
-        self._faults.add(key)
+        if key not in self._faults:
+            with _said_at(f"{where}: faults = {faults!r}, rig {known.file.name}"):
+                known.check_faults(Path(self._file.beside(faults)))
+            self._faults.add(key)
 
     def _planned(
         self,
@@ -511,7 +495,8 @@ class _Expander:
     ) -> tuple[Plan | None, Mapping[str, Any], Mapping[str, str]]:
         """Check parameters on a rig; return the plan if there is one, the parameters, and the files among them."""
         file = known.file
-        try:
+        of = f" (rig {file.name}{''.join(f', {key} = {value}' for key, value in given.items())})"
+        with _said_at(f"{where}: parameters{of}"):
             # The path of a model that does not exist yet is a text like any other.
             parameters = definition.parse(
                 {**given, **dict.fromkeys(referred, "")},
@@ -533,9 +518,6 @@ class _Expander:
                 if expected is not None:
                     check_before_moving(known.description, definition, expected)
                 self._plans[key] = expected
-        except BenchError as error:
-            of = f" (rig {file.name}{''.join(f', {key} = {value}' for key, value in given.items())})"
-            raise ConfigurationError(f"{where}: parameters{of}: {error}") from None
         return self._plans[key], resolved, files
 
     def _digest(self, path: str) -> str:
@@ -544,8 +526,19 @@ class _Expander:
         return self._digests[path]
 
 
-def _is_path(value: object) -> TypeGuard[str]:
-    return isinstance(value, str) and not value.startswith(REFERENCE)
+@contextmanager
+def _said_at(where: str) -> Iterator[None]:
+    """Say of an error within at which place of the file it is."""
+    try:
+        yield
+    except BenchError as error:
+        raise ConfigurationError(f"{where}: {error}") from None
+
+
+def _check_known(where: str, name: str, known: Collection[str], what: str) -> None:
+    """Raise ConfigurationError if a name is none of those that are known."""
+    if name not in known:
+        raise ConfigurationError(f"{where} = {name!r}: there is no {what}; {closest(name, known)}")
 
 
 def _grid(values: Mapping[str, Sequence[T]]) -> Iterator[dict[str, T]]:

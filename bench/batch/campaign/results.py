@@ -142,12 +142,6 @@ def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> list[Ro
     return rows
 
 
-def over_runs(comparisons: Sequence[Row]) -> list[Row]:
-    """Return median, worst and spread of the errors of each model over the runs of a `comparisons_table`."""
-    errors = [key for key in columns_of(comparisons) if key[0] in ERRORS]
-    return _over(comparisons, [("comparison", ""), ("model", "")], errors, "runs")
-
-
 def shown_columns(table: Sequence[Row], varying: Sequence[str]) -> list[Row]:
     """Return the columns of a table of runs that people look at: what varies, and results."""
     left_out = {*_NOT_SHOWN, *({"protocol", "rig", "faults", "seed"} - {*varying})}
@@ -211,7 +205,8 @@ def show_results(expansion: Expansion, done: Mapping[str, Done], folder: Path, c
             summary += of_seeds
     files = {"results": results, "summary": summary}
     if comparisons := comparisons_table(expansion, done):
-        compared = over_runs(comparisons)
+        errors = [key for key in columns_of(comparisons) if key[0] in ERRORS]
+        compared = _over(comparisons, [("comparison", ""), ("model", "")], errors, "runs")
         print_first_rows(compared, "comparisons, over the runs", console)
         files |= {"comparisons": comparisons, "comparisons-summary": compared}
     if values := study_values(expansion, done):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from bench.identification import ModelFile
-from bench.models import IdentifiedDynamics, Operator, TwoStage
+from bench.models import Operator, TwoStage
 
 MARGIN = 1.25
 """Factor of the gain, and of the time constant, by which the specimen may differ from its model."""
@@ -94,7 +94,8 @@ def perturbed_models(file: ModelFile, *, force: bool = False) -> dict[str, Model
     known = file.dynamics
     if known is not None and known.response.lag > 0.0:
         for name, factor in (("lag-high", MARGIN), ("lag-low", 1.0 / MARGIN)):
-            found[name] = replace(file, dynamics=_slower(known, factor))
+            response = replace(known.response, lag=factor * known.response.lag)
+            found[name] = replace(file, dynamics=replace(known, response=response))
     return found
 
 
@@ -106,10 +107,6 @@ def _scaled(model: Any, gain: float, force: bool) -> Any:  # noqa: ANN401 - a mo
     low, high = model.output_range()
     middle = 0.0 if low <= 0.0 <= high and min(-low, high) < 0.1 * (high - low) else 0.5 * (low + high)
     return model.with_coefficients(gain * model.coefficients, gain * (model.bias - middle) + middle)
-
-
-def _slower(dynamics: IdentifiedDynamics, factor: float) -> IdentifiedDynamics:
-    return replace(dynamics, response=replace(dynamics.response, lag=factor * dynamics.response.lag))
 
 
 def cost_of(rms: float, seconds: float, scale: tuple[float, float], time_weight: float = TIME_WEIGHT) -> float:
