@@ -25,7 +25,6 @@ from contextlib import suppress
 from email.message import EmailMessage
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from bench.base import OPTION, ConfigurationError, Stopwatch, json_text, redacted, wall_time
@@ -179,9 +178,7 @@ class Notifier:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.finish()
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:  # noqa: ARG002 - as of all

@@ -119,13 +119,6 @@ def table_definitions(signals: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"CREATE TABLE {table.format(columns=columns)}" for table in _TABLES)
 
 
-def meta_row(key: str, value: object) -> tuple[str, str]:
-    """Return an entry of the metadata as a row without its checksum."""
-    text = json.dumps(value, ensure_ascii=False, default=str)
-    # Characters that no encoding holds, as in a file name of another system, become JSON escapes.
-    return key, text.encode("utf-8", "backslashreplace").decode("utf-8")
-
-
 class Row(NamedTuple):
     """A row that is to be kept: its table, and its columns without the checksum."""
 
@@ -140,7 +133,9 @@ class Row(NamedTuple):
 
 def meta(entries: Mapping[str, object]) -> list[Row]:
     """Return entries of the metadata as rows."""
-    return [Row("meta", meta_row(key, value)) for key, value in entries.items()]
+    texts = {key: json.dumps(value, ensure_ascii=False, default=str) for key, value in entries.items()}
+    # Characters that no encoding holds, as in a file name of another system, become JSON escapes.
+    return [Row("meta", (key, text.encode("utf-8", "backslashreplace").decode())) for key, text in texts.items()]
 
 
 def sealed(table: str, rows: Sequence[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:

@@ -484,7 +484,8 @@ class Guardian:
             self._next_stage(now, self._ending + _SAFE_WITHIN - now)
         complete = not self._pending and not self._stages
         if self._safe is None and (complete or now - self._ending >= _SAFE_WITHIN):
-            self._report_safe()
+            self._safe = self._states()
+            self._news += counted(self._rig.devices.values(), self._lines.late)
             self._next_try = now + _TRY_AGAIN
         if self._safe is not None:
             if self._unsafe and now >= self._next_try:
@@ -511,10 +512,6 @@ class Guardian:
         else:
             self._unsafe[result.device] = f"{type(result.error).__name__}: {result.error}"
         self._box.note("device", device=result.device, state=self._unsafe.get(result.device, IS_SAFE))
-
-    def _report_safe(self) -> None:
-        self._safe = self._states()
-        self._news += counted(self._rig.devices.values(), self._lines.late)
 
     def _states(self) -> dict[str, str]:
         return {name: self._unsafe.get(name, IS_SAFE) for name in self._rig.devices}

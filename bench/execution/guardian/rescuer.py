@@ -27,7 +27,7 @@ from bench.execution.guardian.parent import SIGKILL, ParentProcess
 from bench.execution.guardian.start import start_module
 from bench.execution.notify import Notifier
 from bench.record import Event
-from bench.rig import SAFE, Rescued, load_rig, opened, rescue
+from bench.rig import SAFE, load_rig, opened, rescue
 
 SILENCE = 3.0
 """Silence of a guardian after which it counts as dead, s; it gives a sign of life twice a second."""
@@ -199,9 +199,10 @@ def main() -> int:
     attach = None if content["attach"] is None else Path(content["attach"])
     states: dict[str, str] = {}
     try:
-        with opened(file, attach, "making safe without its guardian", _go_on) as place:
+        # The devices have to be made safe whoever holds a lock.
+        with opened(file, attach, "making safe without its guardian", lambda _: None) as place:
             for seconds, found in rescue(place, limit=TRY_FOR):
-                states = {each.device: _state(each) for each in found}
+                states = {each.device: SAFE if each.is_safe else each.state for each in found}
                 if seconds >= _REPORT_AFTER or all(each.is_safe for each in found):
                     report.write(states)
                     if _has_died(bench):
@@ -262,14 +263,6 @@ def _read(pipe: io.FileIO, signs: queue.SimpleQueue[bytes], told: _Told) -> None
             told.take(sign)
         signs.put(sign)
     signs.put(b"")
-
-
-def _go_on(_: str) -> None:
-    """Take no notice of a lock: the devices have to be made safe whoever holds it."""
-
-
-def _state(found: Rescued) -> str:
-    return SAFE if found.is_safe else found.state
 
 
 if __name__ == "__main__":

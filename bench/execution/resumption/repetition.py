@@ -98,7 +98,8 @@ def repeat(
             if rig is None:
                 raise DataError(f"{run} cannot be repeated: its rig is no longer the same here:\n{error}") from None
             recorded = None
-        own = recorded if _has_own_rig(meta, recorded) else None
+        is_served = str(meta["clock"]).startswith("attached")
+        own = recorded if recorded is not None and recorded.in_process and not is_served else None
         _check_rig(run, own, rig, attach, overrides or {})
         definition = recorded_protocol(run, meta, folder)
         _check_source(run, meta, definition)
@@ -120,10 +121,6 @@ def repeat(
         )
         result = carry_out(asked, console, interrupts)
     return Repetition(run, result, own is not None and meta["clock"] == "virtual")
-
-
-def _has_own_rig(meta: Mapping[str, Any], rig: RigFile | None) -> bool:
-    return rig is not None and rig.in_process and not str(meta["clock"]).startswith("attached")
 
 
 def _check_rig(
