@@ -74,10 +74,15 @@ def find(
         write_json(json_file, {"ports": [asdict(each) for each in known], "devices": {}})
         return
     placed = placements(file, answers(file, known), known)
-    places = [
-        ("–", "–") if one.answer is None else (one.answer.port.name, str(one.answer.identity)) for one in placed
+    rows = [
+        (
+            one.device,
+            one.answer.port.name if one.answer else "–",
+            str(one.answer.identity if one.answer else "–"),
+            one.remark,
+        )
+        for one in placed
     ]
-    rows = [(one.device, *place, one.remark) for one, place in zip(placed, places, strict=True)]
     console.print()
     print_table(console, ("device", "port", "instrument", "remark"), rows, framed=False)
     if write:
