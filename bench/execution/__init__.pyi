@@ -9,11 +9,13 @@ from .rehearsal import (
     Extremes as Extremes,
     Rehearsal as Rehearsal,
 )
+from .resumption.interrupted import (
+    Resume as Resume,
+)
 from .resumption.repetition import (
     repeat as repeat,
 )
 from .resumption.resuming import (
-    Resume as Resume,
     resume as resume,
 )
 from .run import (

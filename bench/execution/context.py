@@ -37,7 +37,6 @@ from bench.execution.guardian.remote import STACKS_NAME, RemoteStation
 from bench.execution.notify import Notifier, facts_of
 from bench.execution.rehearsal import Rehearsal, rehearse
 from bench.execution.resumption.interrupted import Interrupted
-from bench.execution.resumption.repriming import Resumption
 from bench.execution.station.interface import Station
 from bench.execution.station.local import LocalStation
 from bench.execution.terminal import ProgressDisplay, RehearsalDisplay
@@ -189,8 +188,6 @@ class RunContext(ExitStack):
         The connected rig, after `connect`.
     folder : Path
         Of the run, after `open_record`.
-    resumption : Resumption or None
-        Where a run that died goes on, after `open_record`.
     """
 
     def __init__(
@@ -208,7 +205,6 @@ class RunContext(ExitStack):
         self._is_attended = sys.stdin is not None and sys.stdin.isatty()
         self._observers: list[Any] = []
         self._rehearsal: Rehearsal | None = None
-        self.resumption: Resumption | None = None
         self._accuracy: dict[str, Any] | None = None
         self._interrupts = interrupts
 
@@ -283,9 +279,7 @@ class RunContext(ExitStack):
         meta |= metadata(run.protocol, self._stated, description, self._slots, self._planned, epoch)
         if again is not None:
             by_hand = self.guardian is None
-            self.resumption = again.fed(
-                run.protocol, self.parameters, self._slots, description, self.clock, by_hand=by_hand
-            )
+            again.feed(run.protocol, self.parameters, self._slots, description, self.clock, by_hand=by_hand)
         elif run.original:
             meta["repeats"] = run.original.meta["run"]
             for difference in differences(run.original.meta, meta):
@@ -351,7 +345,7 @@ class RunContext(ExitStack):
         if self._again is None:
             engine.warn(self._warnings)
         self._new.keep()
-        outcome = engine.run(run.protocol, self.parameters, self.resumption)
+        outcome = engine.run(run.protocol, self.parameters, self._again)
         if self._dashboard is not None:
             self._dashboard.finish(outcome.status, outcome.reason, outcome.lateness)
         return outcome
@@ -373,9 +367,9 @@ class RunContext(ExitStack):
     def _open_journal(self, files: dict[str, bytes]) -> Journal:
         path, meta, clock, again = self.folder / FILE_NAME, self._meta, self.clock, self._again
         patience = self.rig_file.telemetry.period if clock.sleep_waits else None
-        if again is not None and self.resumption is not None:
+        if again is not None:
             changes = [str(difference) for difference in differences(again.latest, meta)]
-            return again.reopen(path, self.resumption, meta, changes, clock.now(), patience)
+            return again.reopen(path, meta, changes, clock.now(), patience)
         given = files | {RIG_FILE_NAME: self.rig_file.text.encode()}
         # A run on the virtual clock moves nothing, and is done again in the time that its flushes would take.
         return Journal(path, self._signals, meta, given, patience=patience, flushed=clock.sleep_waits)

@@ -32,7 +32,8 @@ from bench.control import Command, DriftEstimator, LimitCycleWatch, agility_for
 from bench.devices import Arrived, Dwell, Settle, Settled, UntilSteady
 from bench.execution import fixed_rate, manual as by_hand
 from bench.execution.notify import Notifier
-from bench.execution.resumption.repriming import Resumption, reprime
+from bench.execution.resumption.interrupted import Interrupted
+from bench.execution.resumption.repriming import reprime
 from bench.execution.run_at_hand import NOT_AT_WORK, Observer, RunAtHand, RunRecord, traced
 from bench.execution.station.interface import Station
 from bench.operator import AT_A_PROMPT, NOBODY, RESUME, Question
@@ -148,7 +149,7 @@ class Engine:
             self._run.event("WARN", "start", text)
 
     def run(
-        self, definition: ProtocolDefinition, parameters: ProtocolParameters, past: Resumption | None = None
+        self, definition: ProtocolDefinition, parameters: ProtocolParameters, past: Interrupted | None = None
     ) -> Outcome:
         """Carry a protocol out, from its first step to the safe state; return how it ended, with its exception.
 
@@ -178,7 +179,7 @@ class Engine:
         return self._finish(error, safe_state)
 
     def _carry_out(
-        self, definition: ProtocolDefinition, parameters: ProtocolParameters, past: Resumption | None
+        self, definition: ProtocolDefinition, parameters: ProtocolParameters, past: Interrupted | None
     ) -> None:
         run = self._run
         if past is not None:

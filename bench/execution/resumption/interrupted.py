@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bench.base import Clock, ConfigurationError, wall_time
-from bench.execution.resumption.feeding import Past, feed
-from bench.execution.resumption.repriming import RESUMED, Resumption
+from bench.execution.resumption.feeding import Fed, Past, feed
 from bench.protocol import LATENESS, TRACES, ProtocolDefinition, ProtocolParameters
 from bench.record import Event, Journal
 from bench.rig import SETPOINT, RigDescription, Slots
 
-if TYPE_CHECKING:
-    from bench.execution.resumption.resuming import Resume
+RESUMED = "resumed"
+"""Kind of the events of a process that takes a run up."""
 
 _DESCRIBED = ("operator", "command", "packages", "git", "host", "devices", "rig_content", "protocol_source")
 """What is kept of each process that takes a run up."""
@@ -25,7 +24,41 @@ _MOST_NAMED = 8
 """Changes that a message names."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class Resume:
+    """What to resume, and how.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder of the run, or its journal.
+    rig : str, optional
+        Where its rig file is now; the one that it was started with if not given.
+    attach : Path, optional
+        Endpoints file of `bench rig emulate`, for a run on a laboratory that is served elsewhere.
+    sigmas : float
+        Standard deviations by which the specimen may differ from the last readings of the record.
+    accept_changes : bool
+        Whether to go on although the protocol, the content of the rig or a version has changed.
+    accept_disagreement : bool
+        Whether to go on although the specimen is not as the record left it.
+    live : bool
+        Whether to serve the live view on the loopback interface.
+    notify : tuple of str
+        Who is sent messages; see `bench.execution.notify`.
+    """
+
+    folder: Path
+    rig: str | None = None
+    attach: Path | None = None
+    sigmas: float = 5.0
+    accept_changes: bool = False
+    accept_disagreement: bool = False
+    live: bool = False
+    notify: tuple[str, ...] = ()
+
+
+@dataclass
 class Interrupted:
     """A run that died.
 
@@ -41,6 +74,16 @@ class Interrupted:
         Time of day of its last row.
     asked : Resume
         How it is to be taken up.
+    fed : Fed
+        The protocol, with its past. This and what follows is known after `feed` only.
+    compared : tuple of str
+        Signals that have to agree with the last readings of the record.
+    drive : str
+        Signal of the slot `drive`; empty if there is none.
+    by_hand : bool
+        Whether what was done by hand has to be done again, as in a new emulated laboratory.
+    zero : float
+        Time of the clock at which the run began, s.
     """
 
     folder: Path
@@ -48,6 +91,11 @@ class Interrupted:
     past: Past
     written: datetime
     asked: Resume
+    fed: Fed = field(init=False)
+    compared: tuple[str, ...] = field(init=False)
+    drive: str = field(init=False)
+    by_hand: bool = field(init=False)
+    zero: float = field(init=False)
 
     @property
     def _resumes(self) -> list[dict[str, Any]]:
@@ -72,15 +120,16 @@ class Interrupted:
     def _epoch(self) -> datetime:
         return datetime.fromisoformat(self.meta["epoch"])
 
-    def fed(
+    def feed(
         self,
         definition: ProtocolDefinition,
         parameters: ProtocolParameters,
         slots: Slots,
         description: RigDescription,
         clock: Clock,
+        *,
         by_hand: bool,
-    ) -> Resumption:
+    ) -> None:
         """Feed the protocol what was recorded.
 
         Raises ConfigurationError if it does other than that, or there is no finished step.
@@ -91,19 +140,20 @@ class Interrupted:
                 f"{self.folder} has the signals {', '.join(missing)}, which rig {description.file.name} does not "
                 "give any more; restore them"
             )
-        fed = feed(definition, parameters, slots, self.past)
-        if fed.step is None:
+        self.fed = feed(definition, parameters, slots, self.past)
+        if self.fed.step is None:
             raise ConfigurationError(f"{self.folder} has no finished step to go on from; start the run again")
-        if fed.message is not None:
-            fed.check_fresh(fed.message)
+        if self.fed.message is not None:
+            self.fed.check_fresh(self.fed.message)
         measured = [slot.signal for slot in slots.values()]
         if not measured:
             setpoints = {f"{name}{SETPOINT}" for name in description.devices}
             measured = [signal.name for signal in description.signals if signal.name not in setpoints]
-        compared = tuple(name for name in dict.fromkeys(measured) if name in self.past.names and name not in traced)
-        zero = 0.0 if self.meta["laboratory_epoch"] is None else (self._epoch - clock.epoch).total_seconds()
-        drive = slots["drive"].signal if "drive" in slots else ""
-        return Resumption(fed, compared, drive, self.asked.sigmas, not self.asked.accept_disagreement, by_hand, zero)
+        known = self.past.names
+        self.compared = tuple(name for name in dict.fromkeys(measured) if name in known and name not in traced)
+        self.zero = 0.0 if self.meta["laboratory_epoch"] is None else (self._epoch - clock.epoch).total_seconds()
+        self.drive = slots["drive"].signal if "drive" in slots else ""
+        self.by_hand = by_hand
 
     @property
     def latest(self) -> dict[str, Any]:
@@ -113,7 +163,6 @@ class Interrupted:
     def reopen(
         self,
         path: Path,
-        resumption: Resumption,
         now: Mapping[str, Any],
         changes: Sequence[str],
         t: float,
@@ -125,8 +174,6 @@ class Interrupted:
         ----------
         path : Path
             The journal.
-        resumption : Resumption
-            The run, as it goes on.
         now : mapping
             Metadata of the run as it would be started now.
         changes : sequence of str
@@ -147,9 +194,9 @@ class Interrupted:
                 f"the run was started otherwise: {'; '.join(changes[:_MOST_NAMED])}{more}. Restore that, or go on "
                 "all the same with --accept-changes"
             )
-        step = resumption.fed.step
+        step = self.fed.step
         assert step is not None
-        t -= resumption.zero
+        t -= self.zero
         gap = (wall_time() - self.written).total_seconds()
         entry = {
             "t": t,

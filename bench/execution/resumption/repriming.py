@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from bench.base import AgreementError, format_numbers
 from bench.devices import Settle, Signal
 from bench.execution.resumption.feeding import Fed
+from bench.execution.resumption.interrupted import RESUMED, Interrupted
 from bench.execution.run_at_hand import RunAtHand
 from bench.rig import Look
-
-RESUMED = "resumed"
-"""Kind of the events of a process that takes a run up."""
 
 NO_STEP = -1
 """Step number of telemetry that belongs to no step."""
@@ -39,40 +36,7 @@ _NORMAL = 0.6745 * math.sqrt(2.0)
 """Median of the magnitude of the difference of two readings with unit standard deviation."""
 
 
-@dataclass(frozen=True)
-class Resumption:
-    """How a run is taken up again.
-
-    Attributes
-    ----------
-    fed : Fed
-        The protocol, with its past.
-    compared : tuple of str
-        Signals that have to agree with the last readings of the record.
-    drive : str
-        Signal of the slot `drive`; empty if there is none.
-    sigmas : float
-        Standard deviations by which they may differ, beside the larger of the resolution and 0.5 % of what the
-        signal went through, for creep. A response may differ besides by what the same of the drive makes of it on the
-        slope of the branch: a set-point is hit a little beside, and a room that has become warmer acts like that.
-    required : bool
-        Whether the run ends if they differ by more; otherwise that is recorded, and the run goes on.
-    by_hand : bool
-        Whether what was done by hand has to be done again, as in a new emulated laboratory.
-    zero : float
-        Time of the clock at which the run began, s.
-    """
-
-    fed: Fed
-    compared: tuple[str, ...]
-    drive: str
-    sigmas: float
-    required: bool
-    by_hand: bool
-    zero: float
-
-
-def reprime(run: RunAtHand, past: Resumption, settle: Callable[[Settle], None]) -> None:
+def reprime(run: RunAtHand, past: Interrupted, settle: Callable[[Settle], None]) -> None:
     """Bring the specimen back by the shortest sequence of its stored corners, and compare it with the record.
 
     It is recorded as telemetry of no step, and as events.
@@ -81,8 +45,8 @@ def reprime(run: RunAtHand, past: Resumption, settle: Callable[[Settle], None]) 
     ----------
     run : RunAtHand
         The run that is resumed.
-    past : Resumption
-        What it is resumed from.
+    past : Interrupted
+        What it is resumed from; the protocol has been fed.
     settle : callable
         Lets the rig settle by a rule; raises if it does not.
 
@@ -122,7 +86,7 @@ def reprime(run: RunAtHand, past: Resumption, settle: Callable[[Settle], None]) 
         run.event("INFO", RESUMED, f"{', '.join(past.compared)}: as in the last readings of the record")
         return
     text = f"after the way back {'; '.join(wrong)}"
-    if past.required:
+    if not past.asked.accept_disagreement:
         raise AgreementError(
             f"{text}; find out what has changed (the specimen, what was done by hand, the instruments), or go on all "
             "the same with --accept-disagreement"
@@ -130,8 +94,13 @@ def reprime(run: RunAtHand, past: Resumption, settle: Callable[[Settle], None]) 
     run.event("WARN", RESUMED, f"{text}; accepted")
 
 
-def _disagreements(run: RunAtHand, past: Resumption, readings: Sequence[Mapping[str, float]]) -> list[str]:
-    """Return what differs from the record by more than `Resumption.sigmas` says."""
+def _disagreements(run: RunAtHand, past: Interrupted, readings: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return what differs from the record by more than is allowed.
+
+    Allowed are so many standard deviations, beside the larger of the resolution and 0.5 % of what the signal went
+    through, for creep. A response may differ besides by what the same of the drive makes of it on the slope of the
+    branch: a set-point is hit a little beside, and a room that has become warmer acts like that.
+    """
     fed = past.fed
     described: Mapping[str, Signal] = run.station.description.by_name
     found = []
@@ -146,7 +115,7 @@ def _disagreements(run: RunAtHand, past: Resumption, readings: Sequence[Mapping[
         # A mean of readings that are near in time shares what wanders slowly: it counts as one reading.
         sigma = math.hypot(recorded, max(recorded, _spread(now)))
         signal = described[name]
-        allowed = past.sigmas * sigma + max(_resolution(fed, signal), _CREEP * _span(fed, name))
+        allowed = past.asked.sigmas * sigma + max(_resolution(fed, signal), _CREEP * _span(fed, name))
         if name == past.drive:
             allowed_of_drive = allowed
         elif past.drive:
@@ -156,7 +125,7 @@ def _disagreements(run: RunAtHand, past: Resumption, readings: Sequence[Mapping[
             *numbers, unit = format_numbers([now.mean(), before.mean(), allowed], signal.unit, signal.precision + 1)
             found.append(
                 f"{name} reads {numbers[0]} {unit} and read {numbers[1]} {unit} in the record; a difference of "
-                f"{numbers[2]} {unit} ({past.sigmas:g} σ, the resolution or 0.5 % of its span, and what "
+                f"{numbers[2]} {unit} ({past.asked.sigmas:g} σ, the resolution or 0.5 % of its span, and what "
                 f"the same of the drive makes of it) is allowed"
             )
     return found

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,45 +14,11 @@ from rich.console import Console
 from bench.base import ConfigurationError, Interrupts, print_plain
 from bench.execution.context import RECORDING_NAME, Run
 from bench.execution.resumption.feeding import Past
-from bench.execution.resumption.interrupted import Interrupted
+from bench.execution.resumption.interrupted import Interrupted, Resume
 from bench.execution.resumption.repetition import recorded_protocol
 from bench.execution.run import RunResult, carry_out
 from bench.record import FILE_NAME, Original, Record, take_in, unpack
 from bench.rig import Holder, Locks, clear_expired_watchdogs, load_rig, opened, rig_of_content
-
-
-@dataclass(frozen=True, kw_only=True)
-class Resume:
-    """What to resume, and how.
-
-    Attributes
-    ----------
-    folder : Path
-        The folder of the run, or its journal.
-    rig : str, optional
-        Where its rig file is now; the one that it was started with if not given.
-    attach : Path, optional
-        Endpoints file of `bench rig emulate`, for a run on a laboratory that is served elsewhere.
-    sigmas : float
-        Standard deviations by which the specimen may differ from the last readings of the record.
-    accept_changes : bool
-        Whether to go on although the protocol, the content of the rig or a version has changed.
-    accept_disagreement : bool
-        Whether to go on although the specimen is not as the record left it.
-    live : bool
-        Whether to serve the live view on the loopback interface.
-    notify : tuple of str
-        Who is sent messages; see `bench.execution.notify`.
-    """
-
-    folder: Path
-    rig: str | None = None
-    attach: Path | None = None
-    sigmas: float = 5.0
-    accept_changes: bool = False
-    accept_disagreement: bool = False
-    live: bool = False
-    notify: tuple[str, ...] = ()
 
 
 def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None) -> RunResult:
