@@ -55,7 +55,6 @@ from .run_metadata import (
     NewFolder as NewFolder,
     current_user as current_user,
     differences as differences,
-    make_folder as make_folder,
     metadata as metadata,
     run_name as run_name,
     version_of as version_of,

@@ -185,17 +185,6 @@ def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Dif
     ]
 
 
-def make_folder(parent: Path, name: str) -> Path:
-    """Make the folder of a run: its name, then the time of day; a counter where two runs start in one second.
-
-    Raises ConfigurationError if it cannot be made; nothing is left of it then.
-    """
-    with NewFolder() as new:
-        folder = new.make(parent, name)
-        new.keep()
-    return folder
-
-
 class NewFolder:
     """The folder of a run that is about to start; a context manager that removes it again unless the run does start.
 
@@ -216,7 +205,10 @@ class NewFolder:
         """The folder, and those above it that were made for it, the innermost first."""
 
     def make(self, parent: Path, name: str) -> Path:
-        """Make the folder; as `make_folder`."""
+        """Make the folder: its name, then the time of day; a counter where two runs start in one second.
+
+        Raises ConfigurationError if it cannot be made.
+        """
         stamp = wall_time().strftime("%Y%m%d-%H%M%S")
         self._made = [each for each in (parent, *parent.parents) if not each.exists()]
         for suffix in ("", *(f"-{i}" for i in range(2, 1000))):

@@ -14,7 +14,7 @@ from rich.console import Console
 from bench.base import ConfigurationError, RecordError
 from bench.execution import Run, carry_out
 from bench.protocol import Dwell, Messages, ProtocolParameters, Step, parameter, protocol
-from bench.record import FILE_NAME, RIG_FILE_NAME, NewFolder, Record, make_folder, recover
+from bench.record import FILE_NAME, RIG_FILE_NAME, NewFolder, Record, recover
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ class TestNewFolder:
     def test_beside_another_run_is_removed_alone(self, tmp_path):
         with NewFolder() as new:
             folder = new.make(tmp_path / "runs", "a")
-            other = make_folder(tmp_path / "runs", "b")
+            other = NewFolder().make(tmp_path / "runs", "b")
         assert [*(tmp_path / "runs").iterdir()] == [other]
         assert not folder.exists()
 

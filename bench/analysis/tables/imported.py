@@ -18,7 +18,7 @@ from bench.analysis.tables.reading.heads import split_unit
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.base import ConfigurationError, DataError, Floats, redacted_command, wall_time
 from bench.devices import Settled, Signal
-from bench.record import FILE_NAME, Event, Journal, StepRecord, current_user, make_folder, version_of
+from bench.record import FILE_NAME, Event, Journal, NewFolder, StepRecord, current_user, version_of
 
 PROTOCOL = "imported"
 """What an imported run has in the place of a protocol."""
@@ -80,7 +80,9 @@ def import_file(
     quantities = data.input, data.output, *data.others
     signals = [_signal(quantity.name, quantity.unit) for quantity in quantities]
     assumptions = [data.assumptions, remark]
-    folder = make_folder(out, f"{_word(path.stem)}-{PROTOCOL}")
+    with NewFolder() as new:
+        folder = new.make(out, f"{_word(path.stem)}-{PROTOCOL}")
+        new.keep()
     columns = dict(zip(("input_column", "output_column"), wanted, strict=False))
     if times is not None and data.time is not None:
         columns[TIME_COLUMN] = data.time.name

@@ -14,9 +14,10 @@ from types import MappingProxyType
 from typing import Any, TextIO
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from bench.base import STACKS, AbortError, BenchError, Clock, GuardianError, Stopwatch, WallClock
-from bench.devices import DeviceDescription, Floats, Identity, Limits, Signal
+from bench.devices import DeviceDescription, Floats, Signal
 from bench.execution.guardian.channel import LONGEST_ANSWER, ChannelError, Message, to_error
 from bench.execution.guardian.rescuer import SILENCE, Report, Rescuer
 from bench.execution.guardian.start import start_guardian
@@ -397,18 +398,8 @@ class RemoteStation(Station):
 
 def _description(file: RigFile, found: Message) -> RigDescription:
     kinds = {entry.name: entry.driver for entry in file.devices}
-    devices = {}
-    for name, content in found["devices"].items():
-        setpoint, limits = content["setpoint_signal"], content["limits"]
-        devices[name] = DeviceDescription(
-            name=name,
-            kind=kinds[name],
-            identity=Identity(**content["identity"]),
-            signals=tuple(Signal(**signal) for signal in content["signals"]),
-            setpoint_signal=None if setpoint is None else Signal(**setpoint),
-            limits=None if limits is None else Limits(**limits),
-            watchdog=content["watchdog"],
-            safe_within=content["safe_within"],
-            reading_limits={name: Limits(**limits) for name, limits in content["reading_limits"].items()},
-        )
-    return RigDescription(file, devices, tuple(Signal(**signal) for signal in found["signals"]))
+    known = TypeAdapter(DeviceDescription)
+    devices = {
+        name: known.validate_python({**content, "kind": kinds[name]}) for name, content in found["devices"].items()
+    }
+    return RigDescription(file, devices, TypeAdapter(tuple[Signal, ...]).validate_python(found["signals"]))
