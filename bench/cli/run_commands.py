@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
+from rich.markup import escape
+from rich.table import Column, Table
 
-from bench.base import BenchError, ConfigurationError, counted, format_duration, print_plain, print_table
+from bench.base import BenchError, ConfigurationError, counted, format_duration, print_plain, print_table, show_table
 from bench.cli.command_support import (
     UNSAFE_EXIT_CODE,
     AttachOption,
@@ -345,8 +346,12 @@ def _print(rehearsal: Rehearsal) -> None:
     ]
     console.print(f"{rehearsal.protocol} on {rehearsal.rig}, {on}", highlight=False)
     print_rows("", rows)
-    heads = ("signal", "lowest", "highest", "unit", "allowed", "margin")
-    print_table(console, heads, [(name, *_cells(each)) for name, each in rehearsal.extremes.items()], framed=False)
+    table = Table(
+        Column("signal", no_wrap=True), "lowest", "highest", "unit", "allowed", "margin", box=None, padding=(0, 1)
+    )
+    for name, each in rehearsal.extremes.items():
+        table.add_row(escape(name), *_cells(each))
+    show_table(console, table)
     for finding in rehearsal.findings:
         console.print(
             f"{format_duration(finding.t):>10}  step {finding.step}, {finding.kind}: {finding.text}",
@@ -361,13 +366,13 @@ def _print(rehearsal: Rehearsal) -> None:
         console.print("nothing would trip" if not rehearsal.findings else "it would complete", highlight=False)
 
 
-def _cells(extremes: Extremes) -> tuple[str | Text, ...]:
+def _cells(extremes: Extremes) -> tuple[str, ...]:
     shown = extremes.display
     plain = replace(shown, unit="")
     allowed = ", ".join(f"{plain.between(each.low, each.high)} ({each.by})" for each in extremes.bounds)
     margin = shown.number(extremes.margin) if math.isfinite(extremes.margin) else ""
-    marked = Text(margin, "bold red" if extremes.margin < 0 else "")
-    return shown.number(extremes.low), shown.number(extremes.high), shown.unit, allowed, marked
+    style = "[bold red]" if extremes.margin < 0 else ""
+    return shown.number(extremes.low), shown.number(extremes.high), shown.unit, allowed, style + margin
 
 
 def resume(
