@@ -149,28 +149,16 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
 
 @dataclass(frozen=True)
 class _Left:
-    """What is left of a journal.
+    """What is left of a journal."""
 
-    Attributes
-    ----------
-    problem : str
-        What SQLite finds wrong.
-    meta : dict of str to object
-        Its metadata.
-    good : dict of str to int
-        By table the number of its good rows.
-    bad, added : dict of str to list
-        By table the keys of its bad rows, and of those that the journal's own tables lack.
-    cut : set of str
-        Tables of which there may be more rows than are known.
-    """
-
-    problem: str
-    meta: dict[str, Any] = field(default_factory=dict)
+    problem: str  # what SQLite finds wrong
+    meta: dict[str, Any] = field(default_factory=dict)  # its metadata
+    # By table the number of its good rows.
     good: dict[str, int] = field(default_factory=lambda: dict.fromkeys(TABLES, 0))
+    # By table the keys of its bad rows, and of those that the journal's own tables lack.
     bad: dict[str, list[Any]] = field(default_factory=lambda: {table: [] for table in TABLES})
     added: dict[str, list[Any]] = field(default_factory=lambda: {table: [] for table in TABLES})
-    cut: set[str] = field(default_factory=set)
+    cut: set[str] = field(default_factory=set)  # tables of which there may be more rows than are known
 
 
 def _gathered(journal: Path, seconds: Sequence[Path], db: sqlite3.Connection) -> _Left:

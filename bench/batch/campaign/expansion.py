@@ -52,26 +52,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Expansion:
-    """The tasks of a campaign file.
+    """The tasks of a campaign file."""
 
-    Attributes
-    ----------
-    tasks : mapping of str to CampaignTask
-        By name; those that others need come before them.
-    varying : mapping of str to tuple of str
-        By the name of a table of runs, what differs among its runs, in the order in which it is shown.
-    plans : mapping of str to (float, float)
-        By the name of a task its planned laboratory time and that on the wall clock, s; those that are known.
-    units : mapping of (str, str) to str
-        Unit of a parameter, by the table of runs and its name.
-    kernels : tuple of str
-        Packages whose kernels the tasks take, but for those of laboratories, which are compiled by now.
-    """
-
-    tasks: Mapping[str, CampaignTask]
+    tasks: Mapping[str, CampaignTask]  # by name; those that others need come before them
+    # By the name of a table of runs, what differs among its runs, in the order in which it is shown.
     varying: Mapping[str, tuple[str, ...]]
+    # By the name of a task its planned laboratory time and that on the wall clock, s; those that are known.
     plans: Mapping[str, tuple[float, float]]
-    units: Mapping[tuple[str, str], str]
+    units: Mapping[tuple[str, str], str]  # unit of a parameter, by the table of runs and its name
+    # Packages whose kernels the tasks take, but for those of laboratories, which are compiled by now.
     kernels: tuple[str, ...]
 
     def announcement(self, before: Collection[str], cores: int) -> str:

@@ -50,27 +50,13 @@ Numbers = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class TuningTrial:
-    """What runs of a controller with some numbers gave.
+    """What runs of a controller with some numbers gave."""
 
-    Attributes
-    ----------
-    numbers : mapping
-        The numbers, as in a tuning file.
-    cost : float
-        See the module.
-    rms : float
-        With the model as it is, output units; infinite if a run failed.
-    seconds : float
-        At each target, s.
-    worst : float
-        RMS with the worst of the other models, output units; infinite if a run failed.
-    """
-
-    numbers: Numbers
-    cost: float
-    rms: float
-    seconds: float
-    worst: float
+    numbers: Numbers  # the numbers, as in a tuning file
+    cost: float  # see the module
+    rms: float  # with the model as it is, output units; infinite if a run failed
+    seconds: float  # at each target, s
+    worst: float  # RMS with the worst of the other models, output units; infinite if a run failed
 
     @property
     def failed(self) -> bool:

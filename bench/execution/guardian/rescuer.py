@@ -107,15 +107,9 @@ class Rescuer:
 
 @dataclass(frozen=True)
 class Report:
-    """The file in which a rescuer says how far it is.
+    """The file in which a rescuer says how far it is."""
 
-    Attributes
-    ----------
-    path : Path
-        Where it is.
-    """
-
-    path: Path
+    path: Path  # where it is
 
     def is_ready(self) -> bool:
         """Return whether a rescuer is ready or at work; not once it has left without an action."""

@@ -58,55 +58,25 @@ _REMARKS = ("phase", "note")
 
 @dataclass(frozen=True)
 class Place:
-    """Where the actuators of a rig stood for a while.
+    """Where the actuators of a rig stood for a while."""
 
-    Attributes
-    ----------
-    setpoints : mapping of str to float
-        Of every actuator that had one by then.
-    settle : Settle or None
-        How the rig settled there; None while a controller moved it.
-    prompt : Prompt or None
-        What had been done by hand last.
-    seconds : float
-        How long the rig stood there, s; 0 while a controller moved it.
-    """
-
-    setpoints: Mapping[str, float]
-    settle: Settle | None
-    prompt: Prompt | None
-    seconds: float
+    setpoints: Mapping[str, float]  # of every actuator that had one by then
+    settle: Settle | None  # how the rig settled there; None while a controller moved it
+    prompt: Prompt | None  # what had been done by hand last
+    seconds: float  # how long the rig stood there, s; 0 while a controller moved it
 
 
 @dataclass(frozen=True)
 class Past:
-    """What a run recorded before it died.
+    """What a run recorded before it died."""
 
-    Attributes
-    ----------
-    steps : tuple of StepRecord
-        Its finished steps.
-    remarks : tuple of (str, str)
-        Kind and text of its phases and notes, in their order.
-    changes : tuple of ParameterChange
-        Parameters that were changed at its pauses, in their order.
-    names : tuple of str
-        The signals of the record.
-    units : mapping of str to str
-        Their units.
-    ticks : Table
-        Its telemetry.
-    last : float
-        Laboratory time of the last row, s.
-    """
-
-    steps: tuple[StepRecord, ...]
-    remarks: tuple[tuple[str, str], ...]
-    changes: tuple[ParameterChange, ...]
-    names: tuple[str, ...]
-    units: Mapping[str, str]
-    ticks: Table
-    last: float
+    steps: tuple[StepRecord, ...]  # its finished steps
+    remarks: tuple[tuple[str, str], ...]  # kind and text of its phases and notes, in their order
+    changes: tuple[ParameterChange, ...]  # parameters that were changed at its pauses, in their order
+    names: tuple[str, ...]  # the signals of the record
+    units: Mapping[str, str]  # their units
+    ticks: Table  # its telemetry
+    last: float  # laboratory time of the last row, s
 
     @classmethod
     def of(cls, record: Record) -> Past:
@@ -126,32 +96,16 @@ class Past:
 
 @dataclass
 class Fed:
-    """A protocol that has been fed its past.
+    """A protocol that has been fed its past."""
 
-    Attributes
-    ----------
-    messages : Messages
-        The protocol, which waits for the reading of `message`.
-    message : Message or None
-        Its first message that is not in the record; None if the protocol had come to its end.
-    past : Past
-        What it was fed.
-    step : StepRecord or None
-        The last step that it was fed.
-    phase : str
-        The phase that it is in.
-    places : list of Place
-        Where the actuators have been, in order.
-    spent : list
-        Controllers of finished fast loops, whose state is not in the record.
-    """
-
-    messages: Messages
-    past: Past
+    messages: Messages  # the protocol, which waits for the reading of `message`
+    past: Past  # what it was fed
+    # Its first message that is not in the record; None if the protocol had come to its end.
     message: Message | None = None
-    step: StepRecord | None = None
-    phase: str = ""
-    places: list[Place] = field(default_factory=list)
+    step: StepRecord | None = None  # the last step that it was fed
+    phase: str = ""  # the phase that it is in
+    places: list[Place] = field(default_factory=list)  # where the actuators have been, in order
+    # Controllers of finished fast loops, whose state is not in the record.
     spent: list[object] = field(default_factory=list)
 
     @property

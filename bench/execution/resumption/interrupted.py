@@ -60,42 +60,20 @@ class Resume:
 
 @dataclass
 class Interrupted:
-    """A run that died.
+    """A run that died."""
 
-    Attributes
-    ----------
-    folder : Path
-        Its folder.
-    meta : mapping
-        What its journal says of it as a whole.
-    past : Past
-        What it has recorded.
-    written : datetime
-        Time of day of its last row.
-    asked : Resume
-        How it is to be taken up.
-    fed : Fed
-        The protocol, with its past. This and what follows is known after `feed` only.
-    compared : tuple of str
-        Signals that have to agree with the last readings of the record.
-    drive : str
-        Signal of the slot `drive`; empty if there is none.
-    by_hand : bool
-        Whether what was done by hand has to be done again, as in a new emulated laboratory.
-    zero : float
-        Time of the clock at which the run began, s.
-    """
-
-    folder: Path
-    meta: Mapping[str, Any]
-    past: Past
-    written: datetime
-    asked: Resume
+    folder: Path  # its folder
+    meta: Mapping[str, Any]  # what its journal says of it as a whole
+    past: Past  # what it has recorded
+    written: datetime  # time of day of its last row
+    asked: Resume  # how it is to be taken up
+    # The protocol, with its past. This and what follows is known after `feed` only.
     fed: Fed = field(init=False)
-    compared: tuple[str, ...] = field(init=False)
-    drive: str = field(init=False)
+    compared: tuple[str, ...] = field(init=False)  # signals that have to agree with the last readings of the record
+    drive: str = field(init=False)  # signal of the slot `drive`; empty if there is none
+    # Whether what was done by hand has to be done again, as in a new emulated laboratory.
     by_hand: bool = field(init=False)
-    zero: float = field(init=False)
+    zero: float = field(init=False)  # time of the clock at which the run began, s
 
     @property
     def _resumes(self) -> list[dict[str, Any]]:

@@ -19,37 +19,19 @@ from bench.rig import InterlockFinding, Look, RigDescription
 
 @dataclass(frozen=True)
 class News:
-    """Something that happened at the station, for the record.
+    """Something that happened at the station, for the record."""
 
-    Attributes
-    ----------
-    level : str
-        `INFO`, `WARN` or `ERROR`.
-    kind : str
-        One word, such as `line`.
-    text : str
-        What happened.
-    """
-
-    level: str
-    kind: str
-    text: str
+    level: str  # `INFO`, `WARN` or `ERROR`
+    kind: str  # one word, such as `line`
+    text: str  # what happened
 
 
 @dataclass(frozen=True)
 class Arrivals:
-    """How far the set-points that were sent last have come.
+    """How far the set-points that were sent last have come."""
 
-    Attributes
-    ----------
-    waiting : tuple of str
-        Devices that have not arrived.
-    error : Exception or None
-        What ended an arrival.
-    """
-
-    waiting: tuple[str, ...]
-    error: Exception | None
+    waiting: tuple[str, ...]  # devices that have not arrived
+    error: Exception | None  # what ended an arrival
 
 
 def counted(devices: Iterable[Device], late: Mapping[str, float] = MappingProxyType({})) -> list[News]:
