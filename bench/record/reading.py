@@ -7,6 +7,7 @@ import sqlite3
 import warnings
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
 from typing import Any, Self
@@ -22,6 +23,7 @@ from bench.record.missing_rows import MissingRows, find_missing_rows
 from bench.record.model_files import models_beside
 from bench.record.opening import OpenedJournal
 from bench.record.rows import FILE_NAME, IDENTITY, NUMBERS, SCHEMA, Event, StepRecord, checksums, is_good, quoted
+from bench.record.store import damage_of
 from bench.record.table import Table
 from bench.rig import is_in_use
 
@@ -83,7 +85,8 @@ class Record:
             raise
         # A recovered copy beside the journal says for itself how far it is good.
         is_silent = "status" not in self.meta and self.path.name == FILE_NAME
-        self._ending = ending_of(self.path.parent) if is_silent else None
+        ending = ending_of(self.path.parent) if is_silent else None
+        self._end: Mapping[str, Any] = self.meta if ending is None else {**asdict(ending), **self.meta}
 
     @property
     def identity(self) -> str:
@@ -143,19 +146,17 @@ class Record:
 
         A run whose bench hung or died is `failed` if its guardian has said so.
         """
-        return str(self.meta.get("status", "unfinished" if self._ending is None else self._ending.status))
+        return str(self._end.get("status", "unfinished"))
 
     @property
     def reason(self) -> str:
         """Why the run was not completed; empty if it was, or if nothing says it."""
-        return str(self.meta.get("reason", "" if self._ending is None else self._ending.reason))
+        return str(self._end.get("reason", ""))
 
     @property
     def safe_state(self) -> Mapping[str, str]:
         """State of each device at the end: `safe`, or the fault; empty if it is not recorded."""
-        found: Mapping[str, str] = self.meta.get(
-            "safe_state", {} if self._ending is None else self._ending.safe_state
-        )
+        found: Mapping[str, str] = self._end.get("safe_state", {})
         return found
 
     def unit(self, signal: str) -> str:
@@ -265,9 +266,8 @@ class Record:
         missing in a run that was completed or whose process died.
         """
         try:
-            (found,) = self._query("PRAGMA quick_check(1)")[0]
-            if found != "ok":
-                return str(self._damaged(str(found).replace("\n", " ")))
+            if found := damage_of(self._db):
+                return str(self._damaged(found))
             for table in ("steps", "events"):
                 deque(self._checked(table), maxlen=0)
             self.files()

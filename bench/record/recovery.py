@@ -29,7 +29,7 @@ from bench.record.rows import (
     table_definitions,
 )
 from bench.record.second_file import NAME as SECOND_NAME, read_second_file, second_files
-from bench.record.store import copied_heading, copy_heading, first_page, insert
+from bench.record.store import copied_heading, copy_heading, damage_of, first_page, insert
 from bench.record.write_ahead_log import log_damage
 
 _KEYS = {"meta": "key", "signals": "position", "files": "rowid", **NUMBERS}
@@ -260,12 +260,7 @@ def _opened(journal: Path) -> tuple[OpenedJournal | None, str]:
             return None, lost
     # A text that is damaged is one whose checksum does not fit.
     opened.db.text_factory = lambda content: content.decode("utf-8", "replace")
-    try:
-        found = str(opened.db.execute("PRAGMA quick_check(1)").fetchone()[0]).replace("\n", " ")
-    except sqlite3.DatabaseError as error:
-        found = str(error)
-    found = "" if found == "ok" else found
-    return opened, lost or found or log_damage(journal.with_name(f"{journal.name}-wal"))
+    return opened, lost or damage_of(opened.db) or log_damage(journal.with_name(f"{journal.name}-wal"))
 
 
 def _opened_without_first_page(journal: Path) -> OpenedJournal:

@@ -114,9 +114,8 @@ class Store:
         """Return what is wrong with the file, by SQLite's own check and the number of rows by table; or nothing."""
         # What is in the file, not what this connection remembers of it.
         with closing(sqlite3.connect(self.path, isolation_level=None)) as db:
-            found = db.execute("PRAGMA quick_check(1)").fetchone()[0]
-            if found != "ok":
-                return str(found)
+            if damage := damage_of(db):
+                return damage
             for table, count in counts.items():
                 (rows,) = db.execute(f"SELECT count(*) FROM {table}").fetchone()  # noqa: S608 - own names
                 if rows != count:
@@ -135,6 +134,16 @@ class Store:
         with suppress(sqlite3.Error):
             self._db.execute("PRAGMA journal_mode=DELETE")
         self._db.close()
+
+
+def damage_of(db: sqlite3.Connection) -> str:
+    """Return what SQLite's own check finds wrong with the pages of a file; empty if nothing."""
+    try:
+        found = str(db.execute("PRAGMA quick_check(1)").fetchone()[0]).replace("\n", " ")
+    # Names in a damaged file may be no text.
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+        return str(error)
+    return "" if found == "ok" else found
 
 
 def insert(db: sqlite3.Connection, rows: Iterable[Row], otherwise: str = "REPLACE") -> None:
