@@ -67,12 +67,14 @@ def options_of(study):
 def errors_of(result):
     """Return the errors among the numbers of a study by their dotted names."""
     # Imported late: most tests do not need it.
-    from bench.batch.campaign.tasks import flat_numbers
+    from bench.batch.campaign.file import dotted
 
     return {
-        name: value
-        for name, (value, _) in flat_numbers(result)
-        if ERRORS & set(name.rpartition(".")[2].split("_")) and not name.endswith("_seconds")
+        name: float(value)
+        for name, value in dotted(result).items()
+        if isinstance(value, (int, float))
+        and ERRORS & set(name.rpartition(".")[2].split("_"))
+        and not name.endswith("_seconds")
     }
 
 

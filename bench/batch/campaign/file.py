@@ -246,5 +246,5 @@ def dotted(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the values of a table and of those within it by dotted key."""
     found: dict[str, Any] = {}
     for key, value in table.items():
-        found |= dotted(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        found |= dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -25,6 +25,7 @@ from bench.analysis import (
     whole_identification,
 )
 from bench.base import AbortError, BenchError, DataError, PlainConsole, Workers, parse_json, registry, write_json_file
+from bench.batch.campaign.file import dotted
 from bench.batch.campaign.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
 from bench.batch.campaign.study_tables import FILE_NAME as STUDY_NAME, write_study
 from bench.batch.study import RunSeries, Study
@@ -271,14 +272,16 @@ class RunTask(CampaignTask):
         if outcome.error is not None and not isinstance(outcome.error, BenchError):
             # A defect of a protocol or of the bench, not a result.
             return result.folder, Done(self.identity, "crashed", outcome.reason)
-        results = {
-            "steps": (outcome.steps, "1"),
-            "laboratory_time": (outcome.laboratory_seconds, "s"),
-            "wall_time": (result.wall_seconds, "s"),
-            **run_results(result.folder),
-        }
+        with Record(result.folder) as record:
+            results = {
+                "steps": (outcome.steps, "1"),
+                "laboratory_time": (outcome.laboratory_seconds, "s"),
+                "wall_time": (result.wall_seconds, "s"),
+                **run_results(record),
+            }
+            warnings = [each.text for each in record.events() if each.kind == "note" and each.level == "WARN"]
         unsafe = "" if outcome.is_safe else f"NOT in the safe state: {dict(outcome.safe_state)}"
-        reason = "; ".join(filter(None, (outcome.reason, unsafe, *warnings_of(result.folder))))
+        reason = "; ".join(filter(None, (outcome.reason, unsafe, *warnings)))
         return result.folder, Done(self.identity, outcome.status if outcome.is_safe else "unsafe", reason, results)
 
 
@@ -383,7 +386,13 @@ class StudyTask(CampaignTask):
         with Workers(1) as workers:
             found = study.carry_out(RunSeries(self.rig or study.rig or "", made, self.seed, False, workers))
         write_study(found, made)
-        return made, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
+        # Units are in the names, or the study's own tables say them.
+        results = {
+            name: (float(value), "")
+            for name, value in dotted(found.values).items()
+            if isinstance(value, (int, float)) and not isinstance(value, bool)
+        }
+        return made, Done(self.identity, "completed", "", results)
 
 
 def completed_run(campaign: Path, name: str) -> Path:
@@ -403,30 +412,13 @@ def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def run_results(folder: Path) -> dict[str, tuple[float, str]]:
+def run_results(record: Record) -> dict[str, tuple[float, str]]:
     """Return what a run that controls a signal has reached: value and unit by name, such as `tracking_rms`."""
-    with Record(folder) as record:
-        controlled = str(record.meta.get("controls", ""))
-        found = results_json(record, controlled) if controlled else {}
-        unit = record.unit(controlled) if controlled else "1"
+    controlled = str(record.meta.get("controls", ""))
+    found = results_json(record, controlled) if controlled else {}
+    unit = record.unit(controlled) if controlled else "1"
     return {
         f"{kind}_{name}": (float(value), "s" if name.startswith("seconds") else unit)
         for kind, values in found.items()
         for name, value in values.items()
     }
-
-
-def warnings_of(folder: Path) -> list[str]:
-    """Return the warnings that the protocol of a run noted."""
-    with Record(folder) as record:
-        return [event.text for event in record.events() if event.kind == "note" and event.level == "WARN"]
-
-
-def flat_numbers(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, tuple[float, str]]]:
-    """Yield each number of the values of a study by its dotted name; what is no number is left out."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from flat_numbers(value, f"{prefix}{key}.")
-        elif isinstance(value, (int, float)) and not isinstance(value, bool):
-            # Units are in the names, or the study's own tables say them.
-            yield f"{prefix}{key}", (float(value), "")
