@@ -95,12 +95,7 @@ class SecondFile:
 def read_second_file(path: Path, identity: str | None = None) -> Iterator[Row]:
     """Yield the intact rows of a second file as they were written; none of a file that is missing or not believed.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    identity : str, optional
-        Number of the journal whose rows are wanted; if not given, rows of any.
+    Those of the journal with this number are wanted, or of any if it is not given.
     """
     wanted = None if identity is None else meta({IDENTITY: identity})[0]
     try:

@@ -30,26 +30,11 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 
 def write_skeleton(part: Part, name: str, parent: Path) -> tuple[Path, ...]:
-    """Write the skeleton of a part into a new folder.
+    """Write the skeleton of a part into the new folder `name` of a parent; return its files, in alphabetical order.
 
-    Parameters
-    ----------
-    part : {"device", "protocol", "model", "rig"}
-        What it is of.
-    name : str
-        Name by which the bench will know it, in lower case with hyphens, such as `micro-balance`.
-    parent : Path
-        Folder in which the folder `name` is made.
-
-    Returns
-    -------
-    tuple of Path
-        The files, in alphabetical order.
-
-    Raises
-    ------
-    ConfigurationError
-        If the name is not allowed or is that of a registered part, the folder exists, or it cannot be written.
+    The bench will know the part by its name, which is in lower case with hyphens, such as `micro-balance`. Raises
+    ConfigurationError if the name is not allowed or is that of a registered part, the folder exists, or it cannot be
+    written.
     """
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or keyword.iskeyword(module):

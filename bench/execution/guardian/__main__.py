@@ -24,14 +24,8 @@ _PATIENCE = 60.0
 def _open(hello: Message, stack: ExitStack) -> tuple[Rig, Rescuer]:
     """Lock and connect the rig that the bench names; return it and what makes it safe if this process cannot.
 
-    Nothing is sent to an instrument that another bench uses.
-
-    Raises
-    ------
-    ConfigurationError
-        If the rig file is wrong, or another bench uses one of the lines or instruments.
-    DeviceError
-        If a device cannot be connected.
+    Nothing is sent to an instrument that another bench uses. Raises ConfigurationError if the rig file is wrong, or
+    another bench uses one of the lines or instruments, and DeviceError if a device cannot be connected.
     """
     file = load_rig(hello["rig"], hello["overrides"])
     if repr(file.content) != hello["content"]:

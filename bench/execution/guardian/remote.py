@@ -163,18 +163,9 @@ class RemoteStation(Station):
         """Have the guardian keep its own record in the folder of the run, and speak for this process if it cannot.
 
         If this process breaks a promise, the guardian has it write there where each of its threads stands, and ends
-        it if it does not come back. If it hung or is gone, the guardian tells so.
-
-        Parameters
-        ----------
-        folder : Path
-            The folder.
-        targets : sequence of str
-            Who is told; see `bench.execution.notify`.
-        facts : mapping of str to str
-            What is said of the run in each message.
-        epoch : str, optional
-            Time of day of the laboratory at the start of the run, ISO 8601; now if not given.
+        it if it does not come back. If it hung or is gone, the guardian tells so: to the `targets`, see
+        `bench.execution.notify`, with the `facts` in each message. `epoch` is the time of day of the laboratory at
+        the start of the run, ISO 8601; now if not given.
         """
         if STACKS is not None:
             self._stacks = (folder / STACKS_NAME).open("w", encoding="utf-8")
@@ -347,12 +338,8 @@ class RemoteStation(Station):
     def _ask(self, do: str, within: float | None = None, **content: Any) -> Any:  # noqa: ANN401 - what JSON holds
         """Send a request and return what is replied.
 
-        Raises
-        ------
-        BenchError
-            What the guardian answered, or what has tripped the station.
-        GuardianError
-            If it is gone, or does not answer.
+        Raises BenchError as the guardian answers or what has tripped the station, and GuardianError if the guardian
+        is gone or does not answer.
         """
         if self._tripped is not None and do != "end":
             raise self._tripped

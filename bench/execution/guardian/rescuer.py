@@ -144,13 +144,9 @@ def in_words(states: Mapping[str, str]) -> str:
 def is_needed(signs: queue.SimpleQueue[bytes]) -> bool:
     """Wait until the guardian is gone or has been silent for too long, or releases this process.
 
-    Of a wait without a sign of life only its nominal time counts: while this process itself got no processor, or the
-    machine was suspended, the guardian may not have got one either.
-
-    Parameters
-    ----------
-    signs : queue.SimpleQueue of bytes
-        What the guardian has written; empty at its end.
+    `signs` are what the guardian has written, empty at its end. Of a wait without a sign of life only its nominal
+    time counts: while this process itself got no processor, or the machine was suspended, the guardian may not have
+    got one either.
     """
     silent, has_begun = 0.0, False
     while silent < SILENCE:

@@ -74,23 +74,9 @@ def start_module(
 ) -> subprocess.Popen[bytes]:
     """Start a module of the bench in a process with a session of its own.
 
-    Parameters
-    ----------
-    module : str
-        Its name.
-    *arguments : str
-        Of its command line.
-    stdin : int
-        As of `subprocess.Popen`.
-    stderr : file, optional
-        Where it writes what goes wrong; where this process does if not given.
-    pass_fds : sequence of int
-        Descriptors that it gets.
-
-    Raises
-    ------
-    GuardianError
-        If it cannot be started.
+    `arguments` are those of its command line, `stdin` is as of `subprocess.Popen`, to `stderr` goes what goes wrong
+    (where this process writes it if not given), and `pass_fds` are descriptors that it gets. Raises GuardianError if
+    it cannot be started.
     """
     # The modules of the rig have to be found as here; -P keeps the working folder out of the way of ours.
     path = os.pathsep.join(entry for entry in sys.path if entry)

@@ -148,23 +148,9 @@ class Interrupted:
     ) -> Journal:
         """Open the journal to write on, and note in it that the run is taken up, by whom, and after which step.
 
-        Parameters
-        ----------
-        path : Path
-            The journal.
-        now : mapping
-            Metadata of the run as it would be started now.
-        changes : sequence of str
-            What is not as it was when the run was carried out last.
-        t : float
-            Time of the clock, s.
-        patience : float or None
-            As of a journal.
-
-        Raises
-        ------
-        ConfigurationError
-            If something has changed and that is not accepted.
+        `now` is the metadata of the run as it would be started now, `changes` what is not as it was when the run was
+        carried out last, `t` the time of the clock, s, and `patience` as of a journal. Raises ConfigurationError if
+        something has changed and that is not accepted.
         """
         if changes and not self.asked.accept_changes:
             more = f", and {len(changes) - _MOST_NAMED} more" if len(changes) > _MOST_NAMED else ""

@@ -39,21 +39,9 @@ _NORMAL = 0.6745 * math.sqrt(2.0)
 def reprime(run: RunAtHand, past: Interrupted, settle: Callable[[Settle], None]) -> None:
     """Bring the specimen back by the shortest sequence of its stored corners, and compare it with the record.
 
-    It is recorded as telemetry of no step, and as events.
-
-    Parameters
-    ----------
-    run : RunAtHand
-        The run that is resumed.
-    past : Interrupted
-        What it is resumed from; the protocol has been fed.
-    settle : callable
-        Lets the rig settle by a rule; raises if it does not.
-
-    Raises
-    ------
-    AgreementError
-        If a signal differs from the last readings by more than is allowed.
+    It is recorded as telemetry of no step, and as events. The protocol of `past` has been fed; `settle` lets the rig
+    settle by a rule, and raises if it does not. Raises AgreementError if a signal differs from the last readings by
+    more than is allowed.
     """
     fed = past.fed
     places = fed.way_back()
