@@ -197,8 +197,11 @@ class CampaignFile:
 
     def where(self, kind: str, number: int) -> str:
         """Return the place of a table for messages, such as `night.toml: runs.0 (characterize)`."""
-        table = getattr(self.tables, kind)[number]
-        return f"{self.path}: {kind}.{number} ({table.label if isinstance(table, RunsTable) else table.name})"
+        return f"{self.path}: {kind}.{number} ({self.names(kind)[number]})"
+
+    def names(self, kind: str) -> list[str]:
+        """Return the names of the tables of a kind, in their order."""
+        return [each.label if isinstance(each, RunsTable) else each.name for each in getattr(self.tables, kind)]
 
     def beside(self, name: str) -> str:
         """Return a path of the file, which is relative to its folder; anything else as it is."""
@@ -223,12 +226,8 @@ def read_campaign(path: Path) -> CampaignFile:
     file = CampaignFile(path, tables)
     if not tables.runs and not tables.studies:
         raise ConfigurationError(f"{path}: asks for nothing; expected tables [[runs]] or [[studies]]")
-    for kind, names in (
-        ("runs", [table.label for table in tables.runs]),
-        ("models", [table.name for table in tables.models]),
-        ("comparisons", [table.name for table in tables.comparisons]),
-        ("studies", [table.name for table in tables.studies]),
-    ):
+    for kind in ("runs", "models", "comparisons", "studies"):
+        names = file.names(kind)
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise ConfigurationError(
