@@ -101,6 +101,7 @@ from .patience import (
 )
 from .printing import (
     PlainConsole as PlainConsole,
+    aligned as aligned,
     html_table as html_table,
     print_plain as print_plain,
     print_table as print_table,

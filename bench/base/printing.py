@@ -101,6 +101,18 @@ def print_table(
     show_table(console, table)
 
 
+def aligned(rows: Sequence[Sequence[str]], numbers_from: int = 99) -> list[str]:
+    """Return rows of texts as lines of aligned columns; those from `numbers_from` on end at one place."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if i < numbers_from else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
 def show_rows(console: Console, title: str, rows: Iterable[tuple[str, str | Text]]) -> None:
     """Print (name, text) pairs under a title."""
     table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))

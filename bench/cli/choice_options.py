@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import fitting_prefix, prefixed, print_plain, significant
+from bench.base import aligned, fitting_prefix, prefixed, print_plain, significant
 from bench.cli.printing import console, print_rows, warn
 
 if TYPE_CHECKING:
@@ -74,8 +74,8 @@ def _print_table(found: SelectedModel) -> None:
     factor, unit = fitting_prefix(found.unit or "units", selection.on_blocks)
     left_out = "runs" if of_runs else "blocks"
     heads = [
-        ("", "", "deg. of", "training", "score", "% of", left_out, "unseen", "", "CPU"),
-        ("", "model", "freedom", unit, unit, "range", unit, f"cycles, {unit}", "rows", "s"),
+        ("", "deg. of", "training", "score", "% of", left_out, "unseen", "", "CPU"),
+        ("  model", "freedom", unit, unit, "range", unit, f"cycles, {unit}", "rows", "s"),
     ]
     usable = [score for score in selection.scores if not score.failure]
     decided = [score for score in usable if score.rows > selection.rows]
@@ -97,24 +97,19 @@ def _print_table(found: SelectedModel) -> None:
     shown += [score for score in (selection.chosen, *decided) if score not in shown]
     rows = [
         (
-            "*" if score is selection.chosen else "",
-            _describe(score.candidate),
+            f"{'*' if score is selection.chosen else ' '} {_describe(score.candidate)}",
             *numbers(score),
             f"{score.seconds:.1f}",
         )
         for score in shown
     ]
-    widths = [max(map(len, column)) for column in zip(*heads, *rows, strict=True)]
     print_plain(console, "models by their score, the RMS error on what was left out of the fit")
-    for row in (*heads, *rows):
-        # Marks and names begin a column, numbers end it.
-        cells = [
-            text.ljust(width) if place < 2 else text.rjust(width)
-            for place, (text, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        print_plain(console, f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
+    for line in aligned([*heads, *rows], numbers_from=1):
+        print_plain(console, line)
     more = len(selection.scores) - len(shown)
-    print_plain(console, "* chosen: the fewest degrees of freedom within 2 % of the least score" + _on_bounded(found))
+    # Of a record of one kind of cycle.
+    bounded = ", among planes with signs that err at most 1.25 times as much" if selection.is_bounded else ""
+    print_plain(console, "* chosen: the fewest degrees of freedom within 2 % of the least score" + bounded)
     failed = len(selection.scores) - len(usable)
     if more > 0:
         unfitted = f", of which {failed} could not be fitted" if failed else ""
@@ -132,11 +127,6 @@ def _print_table(found: SelectedModel) -> None:
         console,
         f"{errors}, {significant(factor * selection.on_runs, 3)} {unit} on another run" if of_runs else errors,
     )
-
-
-def _on_bounded(found: SelectedModel) -> str:
-    """Return the rule of a record of one kind of cycle, if it made the choice."""
-    return ", among planes with signs that err at most 1.25 times as much" if found.selection.is_bounded else ""
 
 
 def read_measured(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.text import Text
 
-from bench.base import ConfigurationError, RecordError, counted, format_duration, print_plain, print_table
+from bench.base import ConfigurationError, RecordError, aligned, counted, format_duration, print_plain, print_table
 from bench.cli.command_support import FigureFormatOption, JsonOption, check_outputs, parse_assignments, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.printing import console, show_compilation
@@ -147,9 +147,7 @@ def _print_runs(folder: Path, runs: list[ListedRun]) -> None:
         duration = "" if run.seconds is None else format_duration(run.seconds)
         started = run.started[:16].replace("T", " ")
         rows.append((started, run.status, run.protocol, run.rig, duration, str(run.steps)))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row, listed in zip(rows, [None, *runs], strict=True):
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+    for line, listed in zip(aligned(rows), [None, *runs], strict=True):
         style = "bold" if listed is None else _STYLES.get(listed.status, "red")
         console.print(Text(line, style), soft_wrap=True)
         if listed is not None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.base import ConfigurationError, counted, header_with_unit, html_table
+from bench.base import ConfigurationError, aligned, counted, header_with_unit, html_table
 from bench.record.rows import StepRecord
 
 _ROWS_SHOWN = 5
@@ -73,8 +73,4 @@ class Table:
     def __repr__(self) -> str:
         """Return size, column heads with units, and the first and last rows."""
         heads, rows = self._shown()
-        widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
-        lines = [
-            "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [heads, *rows]
-        ]
-        return "\n".join([*lines, counted(len(self), "row")])
+        return "\n".join([*aligned([heads, *rows], numbers_from=0), counted(len(self), "row")])
