@@ -331,7 +331,9 @@ def _git_state() -> str:
     here = Path(__file__).parent
 
     def ask(*arguments: str) -> str | None:
-        answer = subprocess.run([git, *arguments], cwd=here, capture_output=True, text=True, check=False)  # noqa: S603
+        # Without locks, which would stay in the repository if this process is killed now.
+        words = [git, "--no-optional-locks", *arguments]
+        answer = subprocess.run(words, cwd=here, capture_output=True, text=True, check=False)  # noqa: S603
         return answer.stdout.strip() if answer.returncode == 0 else None
 
     commit = ask("rev-parse", "--short=12", "HEAD")

@@ -1,7 +1,11 @@
 """A run that cannot start leaves nothing behind; one whose record is lost says how many steps it has."""
 
+import inspect
 import io
+import os
+import shutil
 import signal
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +88,28 @@ def test_filters_are_loaded_before_a_run_on_real_time_begins(asked, monkeypatch)
     carry_out(replace(asked, protocol=see_what_is_loaded, clock="x100", rehearse=False), silent())
     assert LOADED
     assert all(LOADED)
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_a_run_writes_nothing_into_the_repository_of_its_programs(tmp_path, rig_file):
+    def git(*words):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True, capture_output=True)
+
+    git("init")
+    (tmp_path / "file").write_text("content")
+    git("add", "file")
+    git("-c", "user.name=n", "-c", "user.email=e", "commit", "-m", "first")
+    # `git status` would note the new time in its index.
+    os.utime(tmp_path / "file", (1.0, 1.0))
+    index = (tmp_path / ".git" / "index").read_bytes()
+    protocol_file = Path(inspect.getfile(stairs.generator))
+    words = ["run", f"{protocol_file}:stairs", "--rig", rig_file(), "--clock", "virtual", "--out", tmp_path / "runs"]
+    where = {**os.environ, "GIT_DIR": str(tmp_path / ".git"), "GIT_WORK_TREE": str(tmp_path)}
+    subprocess.run([sys.executable, "-m", "bench", *words], check=True, capture_output=True, env=where)
+    (folder,) = (tmp_path / "runs").iterdir()
+    with Record(folder) as record:
+        assert record.meta["git"].endswith(" with changes")
+    assert (tmp_path / ".git" / "index").read_bytes() == index
 
 
 class TestNewFolder:
