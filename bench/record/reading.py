@@ -171,7 +171,9 @@ class Record:
         return self._joined(
             names,
             (
-                self._table("steps", names, [(*row[:3], row[5] not in _FAILED, *row[7:end]) for row in rows])
+                self._table(
+                    names, self._numbers("steps", [(*row[:3], row[5] not in _FAILED, *row[7:end]) for row in rows])
+                )
                 for rows in self._checked("steps")
             ),
         )
@@ -219,17 +221,14 @@ class Record:
 
     def ticks(self, after: int = 0) -> Iterator[Table]:
         """Yield the ticks with numbers beyond `after` in blocks, columns as `telemetry`; of none no block."""
-        names = ("tick", "t", "step", *(signal.name for signal in self.signals))
+        names = ("t", "step", *(signal.name for signal in self.signals))
         for rows in self._blocks("telemetry", after):
-            whole = self._table("telemetry", (*names, "checksum"), rows)
-            numbers = np.column_stack([whole[name] for name in names])
-            wrong = np.flatnonzero(np.array(checksums(numbers), dtype=np.float64) != whole["checksum"])
+            numbers = self._numbers("telemetry", rows)
+            wrong = np.flatnonzero(np.array(checksums(numbers[:, :-1]), dtype=np.float64) != numbers[:, -1])
             if len(wrong):
                 raise self._wrong_row("telemetry", rows[wrong[0]][0])
-            yield Table(
-                {name: whole[name] for name in names if name != "tick"},
-                {name: whole.units[name] for name in names if name != "tick"},
-            )
+            # The tick comes first, the checksum last.
+            yield self._table(names, numbers[:, 1:-1])
 
     def count(self, table: str) -> int:
         """Return how many rows `steps`, `telemetry` or `events` have."""
@@ -309,13 +308,15 @@ class Record:
     def _damaged(self, what: str) -> DataError:
         return DataError(f"{self.path} is damaged: {what}; `bench runs repair {self.path}` says what is good")
 
-    def _table(self, table: str, names: tuple[str, ...], rows: Sequence[tuple[Any, ...]]) -> Table:
+    def _numbers(self, table: str, rows: Sequence[tuple[Any, ...]]) -> npt.NDArray[np.float64]:
         try:
-            data = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+            return np.array(rows, dtype=np.float64)
         except (ValueError, TypeError) as error:
             raise self._damaged(f"table {table}: {error}") from error
-        values = {name: data[:, i].copy() for i, name in enumerate(names)}
-        return Table(values, {name: self.unit(name) for name in names})
+
+    def _table(self, names: Sequence[str], numbers: npt.NDArray[np.float64]) -> Table:
+        columns = {name: column.copy() for name, column in zip(names, numbers.T, strict=True)}
+        return Table(columns, {name: self.unit(name) for name in names})
 
     def _joined(self, names: Sequence[str], blocks: Iterable[Table]) -> Table:
         """Return blocks as one table; a column at a time is copied, so that no more than one is held twice."""
