@@ -16,7 +16,7 @@ def installed() -> dict[str, Any]:
 
     `rigs` have their titles, `protocols`, `models`, `controllers` (as `TASK.NAME`) and `studies` their summaries.
     `fitting` has the protocols that fit each rig, `take_a_model` those that need a model file, `packages` the
-    distributions of what is not the bench's own, and `problems` what could not be loaded, and was left out.
+    distributions of parts that are not the bench's own, and `problems` what could not be loaded, and was left out.
     """
     problems: list[str] = []
     packages: dict[str, str] = {}

@@ -7,6 +7,7 @@ import sqlite3
 import warnings
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -69,20 +70,15 @@ class Record:
             raise DataError(missing(path))
         self._opened = OpenedJournal(self.path)
         self._db = self._opened.db
-        try:
+        with ExitStack() as failed:
+            failed.callback(self.close)
             self._read_heading()
-        except DataError:
-            self.close()
-            raise
-        goes_on = "status" not in self.meta and is_in_use(self.path.parent)
-        try:
+            goes_on = "status" not in self.meta and is_in_use(self.path.parent)
             self._waiting = "" if goes_on else self._take_in()
             self.missing = MissingRows(self.path) if goes_on else find_missing_rows(self._db, self.path, self.meta)
             for text in filter(None, (self._waiting, str(self.missing) if self.missing else "")):
                 warnings.warn(text, IncompleteRecordWarning, stacklevel=2)
-        except (DataError, IncompleteRecordWarning):
-            self.close()
-            raise
+            failed.pop_all()
         # A recovered copy beside the journal says for itself how far it is good.
         is_silent = "status" not in self.meta and self.path.name == FILE_NAME
         ending = ending_of(self.path.parent) if is_silent else None

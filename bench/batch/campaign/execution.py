@@ -68,7 +68,7 @@ def settled(task: CampaignTask, error: BaseException | None, done: Done | None) 
 
 @contextmanager
 def opened_folder(campaign: Path, text: str) -> Iterator[None]:
-    """Hold the folder of a campaign meanwhile, for one process at a time; what is unfinished is removed.
+    """Hold the folder of a campaign meanwhile, for one process at a time; unfinished tasks are removed.
 
     Raises ConfigurationError if another campaign is at work in it, or it cannot be written.
     """
