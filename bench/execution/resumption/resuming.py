@@ -48,10 +48,9 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
         written = max((file.stat().st_mtime for file in folder.glob(f"{FILE_NAME}*")), default=0.0)
         with Record(asked.folder) as record:
             rig = str(record.meta.get("rig"))
+            _check_can_be_resumed(record, asked.folder)
         locks = stack.enter_context(Locks(Holder.of_this_process(rig, f"bench resume {folder}")))
         locks.take_folder(folder)
-        with Record(asked.folder) as record:
-            _check_can_be_resumed(record, asked.folder)
         take_in(asked.folder)
         with Record(asked.folder) as record:
             meta, past, files = record.meta, Past.of(record), record.files()
