@@ -206,7 +206,7 @@ def check(
         code = UNSAFE_EXIT_CODE
     count = sum(bool(finding.advice) for check in checks for finding in check.findings)
     verdict = f"{count} to look at" if count else "all is well"
-    console.print(verdict, highlight=False)
+    console.print(verdict)
     if html is not None:
         from bench.analysis import Page, PageSection, PageTable, write_page
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Column, Table
+from rich.text import Text
 
 from bench.base import BenchError, ConfigurationError, counted, format_duration, print_plain, print_table, show_table
 from bench.cli.command_support import (
@@ -47,7 +47,7 @@ def run(
         typer.Option(
             "--from",
             metavar="RUN",
-            help="Carry this run out again, in place of PROTOCOL; see below.",
+            help="Carry this run out again, in place of PROTOCOL; see above.",
             parser=find_run,
         ),
     ] = None,
@@ -137,7 +137,7 @@ def run(
     from bench.protocol import find_protocol
 
     if help_ or protocol is None:
-        console.print(context.get_help(), highlight=False)
+        console.print(context.get_help())
         if protocol is not None:
             print_protocol(find_protocol(protocol), rig)
         return
@@ -209,9 +209,7 @@ def _repeat(
             comparison = compare_runs(before, now)
         differ = ", ".join(name for name, same in comparison.equal.items() if not same)
         if not differ:
-            console.print(
-                f"as the original: {', '.join(comparison.equal)} are equal to the last bit", highlight=False
-            )
+            console.print(f"as the original: {', '.join(comparison.equal)} are equal to the last bit")
         else:
             text = f"{differ} differ from the original: bench runs compare {found.original} {found.result.folder}"
             warn(text) if found.is_exact else print_plain(console, text)
@@ -235,10 +233,9 @@ def print_result(
         f"{outcome.status}: {counted(outcome.steps, 'step')}, {format_duration(outcome.laboratory_seconds)} of "
         f"laboratory time{end} in {format_duration(result.wall_seconds)}"
         + (f" ({ratio:.0f} times as fast)" if ratio >= 2 else ""),
-        highlight=False,
     )
     if outcome.pace is not None and not outcome.pace.is_reached:
-        console.print(f"clock: {outcome.pace}", highlight=False)
+        console.print(f"clock: {outcome.pace}")
     print_plain(console, f"record: {result.folder}")
     following = "report" if outcome.status == "completed" else "resume" if outcome.steps and can_resume else ""
     if following:
@@ -344,35 +341,33 @@ def _print(rehearsal: Rehearsal) -> None:
         ("duration", f"{least}{format_duration(rehearsal.seconds)}{most}"),
         ("prompts", f"{least}{rehearsal.prompts}"),
     ]
-    console.print(f"{rehearsal.protocol} on {rehearsal.rig}, {on}", highlight=False)
+    console.print(f"{rehearsal.protocol} on {rehearsal.rig}, {on}")
     print_rows("", rows)
     table = Table(
         Column("signal", no_wrap=True), "lowest", "highest", "unit", "allowed", "margin", box=None, padding=(0, 1)
     )
     for name, each in rehearsal.extremes.items():
-        table.add_row(escape(name), *_cells(each))
+        table.add_row(name, *_cells(each))
     show_table(console, table)
     for finding in rehearsal.findings:
         console.print(
             f"{format_duration(finding.t):>10}  step {finding.step}, {finding.kind}: {finding.text}",
             style={"ERROR": "bold red"}.get(finding.level, "yellow"),
-            highlight=False,
-            markup=False,
             soft_wrap=True,
         )
     for text in rehearsal.shortened:
         print_plain(console, text)
     if rehearsal.status == "completed":
-        console.print("nothing would trip" if not rehearsal.findings else "it would complete", highlight=False)
+        console.print("nothing would trip" if not rehearsal.findings else "it would complete")
 
 
-def _cells(extremes: Extremes) -> tuple[str, ...]:
+def _cells(extremes: Extremes) -> tuple[str | Text, ...]:
     shown = extremes.display
     plain = replace(shown, unit="")
     allowed = ", ".join(f"{plain.between(each.low, each.high)} ({each.by})" for each in extremes.bounds)
     margin = shown.number(extremes.margin) if math.isfinite(extremes.margin) else ""
-    style = "[bold red]" if extremes.margin < 0 else ""
-    return shown.number(extremes.low), shown.number(extremes.high), shown.unit, allowed, style + margin
+    style = "bold red" if extremes.margin < 0 else ""
+    return shown.number(extremes.low), shown.number(extremes.high), shown.unit, allowed, Text(margin, style)
 
 
 def resume(

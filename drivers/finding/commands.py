@@ -110,4 +110,4 @@ def _write(path: Path, found: Iterable[Mapping[tuple[str, str], Mapping[str, Any
                 for key in keys.keys() & device.keys() if device.get("line") == name else ():
                     del device[key]
     write_whole(path, tomlkit.dumps(document))
-    console.print(f"written: {path}", highlight=False)
+    console.print(f"written: {path}")

@@ -78,7 +78,7 @@ def print_first_rows(table: Sequence[Row], title: str, console: Console) -> None
         printed.add_row(*(Text(shown(row.get(key))) for key in columns))
     console.print(printed)
     if len(table) > MOST_ROWS:
-        console.print(f"… and {len(table) - MOST_ROWS} rows more", highlight=False)
+        console.print(f"… and {len(table) - MOST_ROWS} rows more")
 
 
 def shown(cell: Cell) -> str:
