@@ -300,11 +300,20 @@ def warmly(warm_start):
 
     @contextmanager
     def patched():
+        derived = {}
         with pytest.MonkeyPatch.context() as patch:
             if warm_start is not None:
                 patch.setattr(WarmPopen, "server", warm_start)
+                # Such as the worker processes of a study.
+                derived = {each: each.__bases__ for each in {*subprocess.Popen.__subclasses__()} - {WarmPopen}}
                 patch.setattr(subprocess, "Popen", WarmPopen)
-            yield
+            try:
+                for each in derived:
+                    each.__bases__ = (WarmPopen,)
+                yield
+            finally:
+                for each, bases in derived.items():
+                    each.__bases__ = bases
 
     return patched
 

@@ -28,6 +28,7 @@ with socket.create_server(("127.0.0.1", int(sys.argv[1]))) as server:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs limits of processes")
+@pytest.mark.usefixtures("warm_popen")
 def test_a_recording_that_could_not_be_written_is_said_in_a_line_and_can_be_rebuilt(tmp_path):
     # Rerun waits for its dead writer for ever, as often as not: the process has to end all the same.
     arguments = ["run", "creep", "--rig", "vo2", "--set", "duration=400", "--clock", "virtual", "--out", tmp_path]
