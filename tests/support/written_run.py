@@ -6,7 +6,7 @@ from bench.devices import Settled, Signal
 from bench.record import FILE_NAME, Event, Journal, Lateness, StepRecord
 
 HOSTILE = "<script>document.title='taken'</script><img src=x onerror=alert(1)>"
-STEPS = 4000
+STEPS = 1000
 SIGNALS = (
     Signal("plate_setpoint", "°C", "set-point", 3),
     Signal("plate", "°C", "temperature", 3),

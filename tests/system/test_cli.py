@@ -305,8 +305,10 @@ class TestIdentifyMuscle:
 
 class TestReportAndExport:
     def test_report_compares_models_of_the_run_and_others(self, bench, tmp_path, finished_run):
-        options = ["--input", "tec_temperature", "--output", "curvature", "--model", "polynomial"]
-        bench("identify", finished_run["folder"], *options, "--out", tmp_path / "model.json")
+        columns = ["--input", "tec_temperature", "--output", "curvature"]
+        bench("identify", finished_run["folder"], *columns, "--model", "polynomial")
+        preisach = ["--model", "preisach-signed", "--levels", "5", "--out", tmp_path / "model.json"]
+        bench("identify", finished_run["folder"], *columns, *preisach)
         code, out, _ = bench(
             "report", finished_run["folder"], "--model", tmp_path / "model.json",
             "--out", tmp_path / "figures", "--json", tmp_path / "report.json",
@@ -315,7 +317,8 @@ class TestReportAndExport:
         assert "completed" in out
         report = json.loads((tmp_path / "report.json").read_text())
         assert report["steps"] == finished_run["steps"]
-        assert report["models"]["polynomial"]["rms"] > 0
+        assert set(report["models"]) == {"polynomial", "preisach-signed"}
+        assert all(model["rms"] > 0 for model in report["models"].values())
         assert report["extremes"]["tec_temperature"]["high"] == pytest.approx(84, abs=0.2)
         assert all(Path(path).stat().st_size > 0 for path in report["figures"])
         page = (tmp_path / "figures" / "report.html").read_text()

@@ -5,30 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_figures import looking_at_figures
 from figure_checks import problems_of
 from matplotlib.figure import Figure
 from rich.console import Console
-from written_run import META, SIGNALS, write_run
+from written_run import META, SIGNALS
 
 from bench.analysis import report_run
-from bench.api import identify
 from bench.devices import Settled, Signal
 from bench.protocol import TRACES
-from bench.record import FILE_NAME, Event, Journal, StepRecord, add_model
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """Look at every figure that is saved; yield what is wrong with each, by its file."""
-    found = {}
-    save = Figure.savefig
-
-    def look(figure, path, **options):
-        found[path.name] = problems_of(figure)
-        save(figure, path, **options)
-
-    monkeypatch.setattr(Figure, "savefig", look)
-    return found
+from bench.record import FILE_NAME, Event, Journal, StepRecord
 
 
 def test_what_is_wrong_with_a_figure_is_found():
@@ -69,10 +55,11 @@ def write_tracking(folder):
     return folder
 
 
-def test_of_a_run_under_control(tmp_path, drawn):
+def test_of_a_run_under_control(tmp_path):
     folder = write_tracking(tmp_path / "run")
     console = Console(file=io.StringIO(), width=160)
-    result = report_run(folder, (), None, console)
+    with looking_at_figures() as drawn:
+        result = report_run(folder, (), None, console)
     assert {"signals.png", "loop.png", "signals.svg", "loop.svg"} <= set(drawn)
     assert {name: problems for name, problems in drawn.items() if problems} == {}
     # The prior of the filter is no uncertainty, and what never moves needs no room.
@@ -81,13 +68,3 @@ def test_of_a_run_under_control(tmp_path, drawn):
     assert "Constant: " in page
     assert "fan 0" in page
     assert "Resets are left out." in page
-
-
-def test_of_models_on_a_run(tmp_path, drawn):
-    folder = write_run(tmp_path / "run", steps=400)
-    found = identify(folder, input="plate", output="tip", model="preisach", levels=8, band=True)
-    for name in ("preisach", "a model with a name that is longer than any legend has room for in one line"):
-        add_model(folder, name, 1.0, found.file.to_json())
-    report_run(folder, (), None, Console(file=io.StringIO()))
-    assert len(drawn) > 4
-    assert {name: problems for name, problems in drawn.items() if problems} == {}

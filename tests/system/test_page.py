@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from cases import cases
+from drawn_figures import looking_at_figures
 from rich.console import Console
 from written_run import HOSTILE, META, write_run
 
@@ -43,11 +44,13 @@ def opened(browser):
 def reported(tmp_path_factory):
     folder = write_run(tmp_path_factory.mktemp("runs") / "run")
     found = identify(folder, input="plate", output="tip", model="preisach", levels=8, band=True)
-    add_model(folder, "preisach", 1.0, found.file.to_json())
+    for name in ("preisach", "a model with a name that is longer than any legend has room for in one line"):
+        add_model(folder, name, 1.0, found.file.to_json())
     published = Published("loops", "largest error", "1.5", "µm", "Fig. 3", ("models", "preisach", "max"), scale=1e6)
     other = Published("tracking", "of another protocol", "1", "", "Fig. 9")
-    result = report_run(folder, (), None, Console(file=io.StringIO()), published=(published, other))
-    return folder, result
+    with looking_at_figures() as drawn:
+        result = report_run(folder, (), None, Console(file=io.StringIO()), published=(published, other))
+    return folder, result, drawn
 
 
 @pytest.fixture(scope="module")
@@ -59,15 +62,21 @@ def page(reported, opened):
 
 class TestPageOfARun:
     def test_it_is_small(self, reported):
-        assert Path(reported[1]["page"]).stat().st_size < 2_000_000
+        assert Path(reported[1]["page"]).stat().st_size < 1_000_000
+
+    def test_every_figure_shows_something_and_nothing_is_covered_or_cut_off(self, reported):
+        assert len(reported[2]) > 4
+        assert {name: problems for name, problems in reported[2].items() if problems} == {}
 
     def test_it_says_in_words_what_happened(self, page):
         text = page[0]["summary"]
         assert "Drive the plate through loops" in text
-        assert "completed after 4000 of 4000 steps" in text
+        assert "completed after 1000 of 1000 steps" in text
         assert "confirmed the safe state" in text
         assert "Interlocks acted 1 times" in text
         assert "Model preisach is off by at most" in text
+        # Of few ticks each is.
+        assert "are drawn" not in "".join(page[0].values())
 
     @cases(
         ("section", "words"),
@@ -75,13 +84,13 @@ class TestPageOfARun:
             ("parameters", ["high", "80", "set", "emulation.noise", "drive"]),
             ("devices-and-calibration", ["TEC-1", "15 to 95", "2025-03-01", "2026-03-01: overdue", "gain", "2.5"]),
             ("interlocks-and-margins", ["≤ 100 °C, for 2 s", "20.", "safe", "equal readings for 60 s", "warn", "1"]),
-            ("phases", ["rise", "decay", "4:26:40", "4:26:40", "2000"]),
+            ("phases", ["rise", "decay", "1:06:40", "1:06:40", "500"]),
             ("signals", ["plate_setpoint", "least margin", "µm"]),
             ("loops-and-models", ["RMS / % of range", "prediction band of preisach", "90 %", "covers"]),
             ("loops-and-models", ["coefficients of preisach", "σ from the residuals", "bias", "density at β"]),
             ("loops-and-models", ["standard uncertainty", "cells swept"]),
             ("numbers-of-the-paper", ["largest error", "1.5", "µm", "Fig. 3"]),
-            ("real-time", ["4000 recorded samples", "greatest", "0.600", "hold: 17 samples at 100 Hz, 2 left out"]),
+            ("real-time", ["1000 recorded samples", "greatest", "0.600", "hold: 17 samples at 100 Hz, 2 left out"]),
             ("events", ["rise", "stands still", "WARN"]),
             ("how-to-repeat-it", ["bench run --from", "bench run loops --set", "0123456789ab", "numpy"]),
         ],
@@ -117,14 +126,14 @@ def test_an_unfinished_run_is_what_there_is_and_marked(tmp_path, opened):
     sections, page = opened(folder / "report.html")
     assert page.query_selector(".badge").inner_text() == "unfinished"
     assert "UNFINISHED" in sections["summary"]
-    assert "20 of 4000 steps" in sections["summary"]
+    assert "20 of 1000 steps" in sections["summary"]
     page.close()
 
 
 def test_a_run_without_a_step_has_a_page(tmp_path):
     folder = write_run(tmp_path / "run", steps=0, finished=False)
     report_run(folder, (), None, Console(file=io.StringIO()))
-    assert "0 of 4000 steps" in (folder / "report.html").read_text()
+    assert "0 of 1000 steps" in (folder / "report.html").read_text()
 
 
 def test_two_runs_have_a_page(tmp_path, opened, bench):
@@ -140,10 +149,3 @@ def test_two_runs_have_a_page(tmp_path, opened, bench):
     assert "30 common steps" in sections["signals"]
     assert len(page.query_selector_all("figure svg")) == 2
     page.close()
-
-
-def test_figures_for_papers(tmp_path, bench):
-    folder = write_run(tmp_path / "run", steps=20)
-    code, _, _ = bench("report", folder, "--figures", "pdf")
-    assert code == 0
-    assert sorted(path.name for path in (folder / "report").iterdir()) == ["loop.pdf", "signals.pdf"]

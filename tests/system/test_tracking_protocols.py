@@ -140,11 +140,6 @@ class TestTracking:
         assert set(ticks["reference"][at_work]) == set(targets)
         assert np.all(ticks["disturbance_uncertainty"][at_work & np.isfinite(ticks["disturbance"])] > 0)
 
-        code, out, _ = bench("report", folder, "--json", tmp_path / "report.json")
-        assert code == 0
-        report = json.loads((tmp_path / "report.json").read_text())
-        assert report["tracking"]["max"] == pytest.approx(float(np.max(np.abs(results.outputs - results.targets))))
-
     def test_a_session_is_recalibrated_before_the_targets(self, bench, models, tmp_path):
         file = write_table(tmp_path / "targets.csv", ["target"], [[400.0], [1400.0], [700.0], [1100.0]])
         errors = {}
