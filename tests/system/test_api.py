@@ -96,7 +96,8 @@ def test_a_table_in_memory_is_identified_as_the_same_in_a_file(tmp_path):
     columns = {"time [s]": time, "U [V]": inputs, "x [mm]": inputs**3}
     frame = pandas.DataFrame(columns)
     frame.to_csv(tmp_path / "table.csv", index=False)
-    models = [bench.identify(source, input="U", output="x") for source in (tmp_path / "table.csv", frame, columns)]
+    sources = (tmp_path / "table.csv", frame, columns)
+    models = [bench.identify(each, "polynomial,polynomial-plays", input="U", output="x") for each in sources]
     outputs = [bench.predict(model, inputs, times=time) for model in models]
     np.testing.assert_allclose(outputs[1:], [outputs[0], outputs[0]], rtol=1e-12)
     assert {(model.data.input.unit, model.data.output.unit) for model in models} == {("V", "mm")}

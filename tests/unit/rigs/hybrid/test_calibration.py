@@ -27,7 +27,7 @@ signal = "displacement"
 
 
 def test_a_calibrated_sensor_is_accurate_to_nanometres(bench, tmp_path):
-    sweep = {"sweeps": "1", "period": "300", "cooling": "-0.05", "heating": "0.05"}
+    sweep = {"sweeps": "1", "period": "150", "cooling": "-0.05", "heating": "0.05"}
     code, _, err = bench(
         "run", "calibration-displacement", "--rig", "hybrid-witness", "--clock", "virtual", "--out", tmp_path,
         "--json", tmp_path / "run.json",
