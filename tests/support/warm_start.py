@@ -68,10 +68,6 @@ def begin(request, streams):
         os.close(opened)
     if "parent" in request:
         take_parent(request["parent"])
-    if request.get("new_session"):
-        os.setsid()
-    if request.get("group", -1) >= 0:
-        os.setpgid(0, request["group"])
     os.chdir(request["folder"])
     os.environ.clear()
     os.environ.update(request["environment"])
@@ -120,10 +116,17 @@ def carry_out(option, *rest):
 
 def start(request, streams, sockets, descriptors):
     """Fork for a request; return the process id. The new process leaves the sockets and descriptors of this one."""
+    waiting, grouped = os.pipe()
     process = os.fork()
     if process == 0:
         code = 1
         try:
+            if request.get("new_session"):
+                os.setsid()
+            if request.get("group", -1) >= 0:
+                os.setpgid(0, request["group"])
+            os.close(waiting)
+            os.close(grouped)
             for each in sockets:
                 each.close()
             for each in descriptors:
@@ -138,6 +141,10 @@ def start(request, streams, sockets, descriptors):
             os._exit(code)
     for each in streams:
         os.close(each)
+    # Whoever asks for its group, to end it with all that it started, would be given that of this process before.
+    os.close(grouped)
+    os.read(waiting, 1)
+    os.close(waiting)
     return process
 
 

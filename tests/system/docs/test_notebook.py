@@ -1,6 +1,7 @@
 """The how-to about notebooks, executed as a notebook: every result shows itself."""
 
 import re
+import subprocess
 from pathlib import Path
 
 import nbformat
@@ -14,14 +15,20 @@ CODE, PRINTED = (
 
 
 @pytest.fixture(scope="module")
-def cells(tmp_path_factory):
+def cells(tmp_path_factory, warmly):
     """Execute the blocks of the page; return the outputs by the last line of their cell."""
+    import jupyter_client.launcher
+
     code = [nbformat.v4.new_code_cell(cell) for block in CODE for cell in block.split("\n\n")]
     notebook = nbformat.v4.new_notebook(cells=code)
     folder = tmp_path_factory.mktemp("notebook")
-    NotebookClient(
+    client = NotebookClient(
         notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
-    ).execute()
+    )
+    with warmly(), pytest.MonkeyPatch.context() as patch:
+        # Its name for this was bound when it was imported.
+        patch.setattr(jupyter_client.launcher, "Popen", subprocess.Popen)
+        client.execute()
     return {cell.source.splitlines()[-1]: cell.outputs for cell in notebook.cells}
 
 
