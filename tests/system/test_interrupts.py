@@ -106,6 +106,15 @@ class TestFlags:
         assert seen == [before, False]
 
 
+AT_ITS_TERMINAL = """
+import fcntl, runpy, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+del sys.argv[0]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+"""What makes its standard input the terminal of its session, and runs a script."""
+
+
 class Process:
     """A run in a process of its own, on the wall clock."""
 
@@ -113,16 +122,16 @@ class Process:
         self.folder = tmp_path / "runs"
         self.witness = tmp_path / "witness.txt"
         script = str(SUPPORT / "run_heater.py")
-        command = [sys.executable, script, str(self.folder), rig, clock, f"{PROTOCOLS}:{protocol}"]
+        command = [script, str(self.folder), rig, clock, f"{PROTOCOLS}:{protocol}"]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(SUPPORT), str(SUPPORT.parents[1])])}
         self.terminal = None
         if terminal:
             self.terminal, inner = pty.openpty()
             streams = {"stdin": inner, "stdout": inner, "stderr": inner, "start_new_session": True}
-            keys["preexec_fn"] = _take_terminal
+            command = ["-c", AT_ITS_TERMINAL, *command]
         else:
             streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        self.process = subprocess.Popen([*command, *settings], env=environment, **streams, **keys)
+        self.process = subprocess.Popen([sys.executable, *command, *settings], env=environment, **streams, **keys)
         if terminal:
             os.close(inner)
         self.output = ""
@@ -173,13 +182,6 @@ class Process:
             self.process.stdout.close()
         if self.terminal is not None:
             os.close(self.terminal)
-
-
-def _take_terminal():
-    import fcntl
-    import termios
-
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
 @pytest.fixture
