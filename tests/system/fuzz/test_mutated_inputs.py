@@ -10,6 +10,9 @@ from mutations import mutated_bytes, mutated_document, mutated_lines, objections
 
 from bench.record import Record
 
+# What reads the files of libraries is a process of its own.
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 FEW = 3
 """Inputs of each kind; tools/mutated_inputs.py tries thousands."""
 

@@ -10,6 +10,9 @@ from lab_tables import ROWS, U, Y, body, check, matlab, parquet, table, write
 from bench.analysis import ColumnNames, ReadingOptions, read_columns, read_dataset
 from bench.base import DataError
 
+# What reads the files of libraries is a process of its own.
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 LINES = body().splitlines(keepends=True)
 BODY, TABLE = body(), table()
 

@@ -13,6 +13,9 @@ from bench.base import ConfigurationError, DataError
 from bench.devices import Settled, Signal
 from bench.record import FILE_NAME, Journal, StepRecord
 
+# What reads the files of libraries is a process of its own.
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 
 @pytest.fixture
 def table(tmp_path):
