@@ -3,7 +3,8 @@
 1. Each family is tried in all its structures, from saturation or at rest, with a medium penalty.
 2. The best structure of each family is tried with the other penalties, then from the other initial memories.
 3. Where times are known, the best of each family is tried with each dynamic element, one after the other as long as
-   the score falls. Then the best of all is tried once more in its other structures, and from its other memories.
+   the score falls; after each element the better half of the families goes on. Then the best of all is tried once
+   more in its other structures, and from its other memories.
    Of a long record all this is done on evenly chosen rows, and the best of two models are then scored on all rows.
 4. The rule: the least score wins; among those within 2 % of it, the fewest degrees of freedom. A record of one kind
    of cycle cannot tell models apart on other cycles: there a plane with signs wins unless it errs 1.25 times as much.
@@ -249,7 +250,11 @@ class _Search:
         self._reshape("initial memories", [min(some, key=lambda score: score.error) for some in scores if some])
 
     def dynamics(self) -> None:
-        """Try the best of each model with dynamic elements, one after the other as long as the score falls."""
+        """Try the best of each model with dynamic elements, one after the other as long as the score falls.
+
+        After each element the better half of the models goes on (successive halving; Karnin, Koren and Somekh, ICML
+        2013): an element tells far more of a model than which of the last ones comes first.
+        """
         going = self._best(in_time=True) if self.measured.times is not None else []
         while going:
             batches = []
@@ -259,7 +264,8 @@ class _Search:
                 among = [name for name in (*OTHERS, *(AFTER_LAG if is_lagged else ("lag",))) if name not in before]
                 tried = [with_element(before, element) for element in among]
                 batches.append([replace(best.candidate, dynamics=",".join(elements)) for elements in tried])
-            going = self._improve("dynamics", going, batches)
+            better = self._improve("dynamics", going, batches)
+            going = sorted(better, key=lambda score: score.error)[: -(-len(going) // 2)]
 
     def once_more(self) -> None:
         """Try the other structures of the best of all, as its own was found before its memory, then its memories."""

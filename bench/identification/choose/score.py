@@ -27,7 +27,7 @@ from bench.identification.choose.splits import (
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Sign, has_orientation
 from bench.identification.timed.hammerstein_fit import reshape, set_up_search
-from bench.identification.timed.hammerstein_search import Search, find_best
+from bench.identification.timed.hammerstein_search import COMPARING, Search, find_best
 from bench.models import Regressor, overwritten_from
 
 # Turns smaller than this part of the range need not be kept when rows are left out.
@@ -38,8 +38,6 @@ _LEAST_MOVE = 0.005
 _KNOWN = 0.25
 # Part of the rows that may be left out of a fit for their memory. Source: most rows then remain.
 _SKIPPED = 0.5
-# Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
-_SHAPE = 1e-3
 
 
 FAILURES = (BenchError, ValueError, ArithmeticError)
@@ -315,9 +313,9 @@ def _set_up_in_time(
     search = searches[static]
     _check_skipped(measured, search.static)
     elements = tuple(candidate.dynamics.split(","))
-    found = find_best(search, elements, candidate.parameters, rounds=1)
+    found = find_best(search, elements, candidate.parameters, rounds=1, stage=COMPARING)
     if reshaped or not candidate.shape:
-        search, found = reshape(search, found, _SHAPE)
+        search, found = reshape(search, found, COMPARING.tolerance)
     responses, sign = search.responses(found.elements, found.values), search.sign(found.fit)
 
     def fit(weights: Floats, one: Candidate, start: Fit | None) -> Fit:

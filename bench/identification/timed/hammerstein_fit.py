@@ -26,7 +26,7 @@ from bench.identification.fit.regularization import Regularization
 from bench.identification.fit.variable_projection import Evidence, Stage, variable_projection
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
-from bench.identification.timed.hammerstein_search import Found, Search, beside, find_best, search_ends
+from bench.identification.timed.hammerstein_search import COMPARING, Found, Search, beside, find_best, search_ends
 from bench.identification.timed.parsimony import check_size, schwarz
 from bench.identification.trust import judge_fit
 from bench.models import Hammerstein, HammersteinState, check_sequence
@@ -43,8 +43,6 @@ _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading
 # step of its differences. Derivation: a regressor of that size takes 4 MB, and each step forms some; the step is the
 # root of 1e-12, to which a fit is exact.
 _RESHAPED, _STEP_OF_SHAPE = 500_000, 1e-6
-# A search that only chooses among elements. Source: a choice; one start and a fifth of the usual evaluations.
-_PROMISE = Stage(starts=1, tolerance=1e-9, evaluations=8)
 # Evaluations of a search for a shape: it and a lag stand for each other along a valley. Source: measured; 40 may
 # leave three times the error on other inputs.
 _EVALUATIONS = 200
@@ -239,7 +237,7 @@ def choose_elements(search: Search) -> tuple[Search, Found]:
         for element in among:
             if element not in found.elements:
                 elements = with_element(found.elements, element)
-                trials += search_ends(search, elements, search.named(found), _PROMISE)
+                trials += search_ends(search, elements, search.named(found), COMPARING)
         # Only the most promising is worth the constrained fit.
         least = min(trials, key=criterion)
         reshaped, best = reshape(search, find_best(search, least.elements, search.named(found), rounds=1))

@@ -123,7 +123,7 @@ class LinearPart(Document):
         rate = np.full(count, 0.0 if state is None else state.rate)
         steps = durations(t)
         rows, elapsed = self._moments(t, steps)
-        steps_after = np.append(steps, 1.0)[rows]
+        steps_after = np.append(steps, steps[-1:] if steps.size else 1.0)[rows]
         shares = elapsed / steps_after
         result = np.asarray(_kernels.delayed(values, rows, shares, self.gain))
         offs = np.empty((1 + self.creep_times.size, count))
@@ -198,6 +198,8 @@ def passages(lag: tuple[float, float], elapsed: Floats, steps: Floats) -> Floats
     elapsed, steps : ndarray, shape (N,)
         Time since the begin of a step, and the whole step, s.
     """
+    if elapsed.size > 1 and (elapsed == elapsed[0]).all() and (steps == steps[0]).all():
+        return np.repeat(passages(lag, elapsed[:1], steps[:1]), elapsed.size, axis=0)
     first, second = lag
     result = np.zeros((elapsed.size, 6))
     leave, turn, _, slope, pull, hold = result.T

@@ -127,6 +127,23 @@ def test_rows_of_known_memory_are_tested_alone_if_they_go_through_the_range(turn
     assert measured.known == known
 
 
+def test_after_each_dynamic_element_the_better_half_of_the_models_goes_on():
+    rng = np.random.default_rng(2)
+    times = 0.01 * np.arange(300)
+    inputs = np.sin(4.0 * times) * (0.4 + 0.6 * np.abs(np.sin(0.7 * times))) + 0.2 * np.sin(11.0 * times)
+    speeds = np.gradient(inputs, times)
+    outputs = settled(PLANTS["bouc-wen"], inputs) + 0.3 * speeds + 0.1 * np.tanh(speeds / 2.0)
+    measured = Measurements.of(inputs, outputs + 0.01 * rng.standard_normal(300), times=times)
+    models = ("polynomial", "polynomial-plays", "prandtl-ishlinskii")
+    best: dict[int, dict[str, float]] = {1: {}, 2: {}}
+    for score in select(measured, models).scores:
+        count = len(score.candidate.dynamics.split(",")) if score.candidate.dynamics else 0
+        if count in best:
+            best[count][score.candidate.model] = min(best[count].get(score.candidate.model, np.inf), score.error)
+    assert set(best[1]) == set(models)
+    assert set(best[2]) == set(sorted(models, key=lambda model: best[1][model])[:2])
+
+
 def test_what_starts_from_the_parameters_that_were_found_scores_the_same():
     rng = np.random.default_rng(4)
     times = 0.01 * np.arange(300)
