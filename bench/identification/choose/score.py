@@ -38,6 +38,8 @@ _LEAST_MOVE = 0.005
 _KNOWN = 0.25
 # Part of the rows that may be left out of a fit for their memory. Source: most rows then remain.
 _SKIPPED = 0.5
+# Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
+_SHAPE = 1e-3
 
 
 FAILURES = (BenchError, ValueError, ArithmeticError)
@@ -315,7 +317,7 @@ def _set_up_in_time(
     elements = tuple(candidate.dynamics.split(","))
     found = find_best(search, elements, candidate.parameters, rounds=1, stage=COMPARING)
     if reshaped or not candidate.shape:
-        search, found = reshape(search, found, COMPARING.tolerance)
+        search, found = reshape(search, found, _SHAPE)
     responses, sign = search.responses(found.elements, found.values), search.sign(found.fit)
 
     def fit(weights: Floats, one: Candidate, start: Fit | None) -> Fit:
