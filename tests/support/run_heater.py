@@ -3,8 +3,7 @@
 import sys
 from pathlib import Path
 
-from rich.console import Console
-
+from bench.base import PlainConsole
 from bench.execution import Run, carry_out
 from bench.protocol import find_protocol
 
@@ -22,7 +21,7 @@ def main() -> int:
         # What is sent to the process is meant for the run.
         rehearse=False,
     )
-    outcome = carry_out(run, Console(width=200)).outcome
+    outcome = carry_out(run, PlainConsole(width=200)).outcome
     print("OUTCOME", outcome.status, outcome.steps, outcome.is_safe, outcome.reason, flush=True)
     return 0 if outcome.error is None else getattr(outcome.error, "exit_code", 1)
 

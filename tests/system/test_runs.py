@@ -6,9 +6,8 @@ import pytest
 from cases import cases
 from heater_laboratory import CLOSED, HeaterLaboratory, HeaterTEC
 from heater_protocols import Stairs, settle, stairs
-from rich.console import Console
 
-from bench.base import ConfigurationError, DeviceConnectionError, Expectation
+from bench.base import ConfigurationError, DeviceConnectionError, Expectation, PlainConsole
 from bench.devices import Signal
 from bench.execution import Run, carry_out
 from bench.execution.dialogue import Dialogue
@@ -21,7 +20,7 @@ from bench.rig import load_rig
 
 @pytest.fixture
 def console():
-    return Console(file=io.StringIO(), width=200)
+    return PlainConsole(file=io.StringIO(), width=200)
 
 
 @pytest.fixture
@@ -176,7 +175,7 @@ EXPECTED = Expectation(((1, 4.0), (2, 8.0)), 8.0, at_most=90.0)
 
 class TestDisplay:
     def show(self, **keys):
-        console = Console(file=io.StringIO(), width=160, **keys)
+        console = PlainConsole(file=io.StringIO(), width=160, **keys)
         with ProgressDisplay(console, "x[/red].py", SIGNALS, ("tec_temperature",), EXPECTED) as display:
             display.event(Event(0.0, "INFO", "phase", "climb [/red]"))
             display.event(Event(3661.0, "INFO", "note", "there [bold]now"))
@@ -206,7 +205,7 @@ class TestDisplay:
                 return super().write(text)
 
         file = Gone()
-        with ProgressDisplay(Console(file=file, force_terminal=True), "stairs", SIGNALS, (), EXPECTED):
+        with ProgressDisplay(PlainConsole(file=file, force_terminal=True), "stairs", SIGNALS, (), EXPECTED):
             file.lost = True
 
 
@@ -214,7 +213,7 @@ class Screen:
     """A terminal whose display was entered, with a dialogue on it."""
 
     def __init__(self, **keys):
-        self.console = Console(file=io.StringIO(), width=160, **keys)
+        self.console = PlainConsole(file=io.StringIO(), width=160, **keys)
         self.display = ProgressDisplay(self.console, "stairs", SIGNALS, ("tec_temperature",), EXPECTED)
         self.dialogue = Dialogue(self.console, self.display, None, at_terminal=True)
 
