@@ -59,14 +59,17 @@ def show_table(console: Console, table: Table) -> None:
         Its cells are texts.
     """
     columns = [[_text(console, cell) for cell in column.cells] for column in table.columns]
-    heads = [_text(console, column.header) for column in table.columns] if table.show_header else []
-    measured = [[head, *cells] for head, cells in zip(heads, columns, strict=True)] if heads else columns
-    whole = [max((_longest_line(text) for text in texts), default=0) for texts in measured]
+    heads = [_text(console, column.header) if table.show_header else Text() for column in table.columns]
+    whole = [max(map(_longest_line, (head, *cells))) for head, cells in zip(heads, columns, strict=True)]
     least = [
-        length if column.no_wrap else max((_longest_word(text) for text in texts), default=0)
-        for column, texts, length in zip(table.columns, measured, whole, strict=True)
+        length if column.no_wrap else max(map(_longest_word, (head, *cells)))
+        for column, head, cells, length in zip(table.columns, heads, columns, whole, strict=True)
     ]
     room = console.width - _beside_texts(table)
+    unbroken = list(map(max, least, map(_longest_line, heads)))
+    if sum(unbroken) <= room:
+        # A head stays in one line where there is room.
+        least = unbroken
     if sum(whole) > room >= sum(least):
         for column, width in zip(table.columns, _widths(least, whole, room), strict=True):
             column.width = width
@@ -140,7 +143,7 @@ def _print_block(console: Console, heads: Sequence[str], row: Sequence[Text], co
         console.print(name, style="bold", soft_wrap=True)
     for i, (text, column) in enumerate(zip(others, columns[1:], strict=True), 1):
         if text.plain.strip():
-            head = f"{heads[i]}: " if heads and heads[i] else ""
+            head = f"{heads[i]}: " if heads[i] else ""
             line = Text.assemble(_INDENT, head, text)
             console.print(line, style=column.style, soft_wrap=True)
 
