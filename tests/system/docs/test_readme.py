@@ -1,5 +1,7 @@
 """The README and the pages for contributors: code runs, commands and options exist, links lead somewhere."""
 
+import ast
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -8,6 +10,7 @@ import pytest
 from cases import cases
 from typer.main import get_command
 
+import bench
 from bench.cli import app
 
 ROOT = Path(__file__).parents[3]
@@ -60,6 +63,18 @@ def test_every_command_and_option_exists(line):
 @cases("target", sorted({line.split()[1] for line in commands() if line.startswith("make ")}))
 def test_every_target_of_make_exists(target):
     assert re.search(rf"^\.PHONY:.* {target}( |$)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+@cases("page", PAGES)
+def test_python_takes_from_the_bench_what_it_has(page):
+    for block in re.findall(r"^```python[^\n]*\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("bench", "drivers", "sim_devices"):
+                module = importlib.import_module(node.module)
+                missing = [each.name for each in node.names if not hasattr(module, each.name)]
+                assert not missing, f"{node.module} has no {missing}"
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "bench":
+                assert hasattr(bench, node.attr), f"bench has no {node.attr}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
