@@ -1,5 +1,7 @@
 """The campaign of perturbed specimens can be carried out, and the part that takes a minute reaches its goals."""
 
+import json
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,10 +71,15 @@ def minute(tmp_path_factory):
     with Workers(1) as workers:
         done = carry_out_tasks(tasks, {}, WorkersExecutor(workers, out))
     return {
-        (task.table, task.parameters["controller"], task.overrides.get(PLANT, NOMINAL)): done[name]
+        (task.table, task.parameters["controller"], plant_of(task)): done[name]
         for name, task in tasks.items()
         if isinstance(task, RunTask) and task.models
     }
+
+
+def plant_of(task):
+    """Return what differs in the plant of a run, as JSON."""
+    return json.dumps(tomllib.loads(f"plant = {task.overrides.get(PLANT, NOMINAL)}")["plant"])
 
 
 def result(found, name):
@@ -83,7 +90,7 @@ def result(found, name):
 @pytest.mark.seeds
 class TestMinute:
     def test_a_film_that_overshoots_is_tracked(self, minute):
-        plant = '{"loop_damping" = 0.6}'
+        plant = '{"loop_damping": 0.6}'
         closed, opened = (minute["film-tracking", name, plant] for name in (CLOSED, OPEN))
         assert (closed.status, opened.status) == ("completed", "completed")
         assert result(closed, "tracking_rms") <= 8.0
@@ -91,7 +98,7 @@ class TestMinute:
         assert result(opened, "tracking_rms") <= 45.0
 
     def test_an_open_loop_beyond_twice_its_nominal_error_is_stopped(self, minute):
-        plant = '{"session_offset" = 0.36}'
+        plant = '{"session_offset": 0.36}'
         opened, nominal = minute["film-tracking", OPEN, plant], minute["film-tracking", OPEN, NOMINAL]
         assert nominal.status == "completed"
         assert opened.status == "failed"
@@ -104,12 +111,12 @@ class TestMinute:
     def test_a_wire_of_another_time_constant_is_tracked(self, minute):
         for table, most in (("wire-length", 0.02e-3), ("wire-force", 0.05)):
             found = {plant: done for (of, _, plant), done in minute.items() if of == table}
-            assert list(found) == [NOMINAL, '{"time_constant" = 3.5}', '{"time_constant" = 6.5}']
+            assert list(found) == [NOMINAL, '{"time_constant": 3.5}', '{"time_constant": 6.5}']
             assert {done.status for done in found.values()} == {"completed"}
             assert max(result(done, "tracking_rms") for done in found.values()) <= most
 
     def test_a_beam_in_a_warm_room_is_moved_smoothly(self, minute):
-        plant = '{"ambient_temperature" = 27.0}'
+        plant = '{"ambient_temperature": 27.0}'
         found = minute["beam-rooms", "hybrid", plant]
         assert found.status == "completed"
         assert result(found, "loop_true_move_max") <= 100e-9

@@ -1012,7 +1012,7 @@ def test_the_viewer_shows_three_loops_and_two_planes_at_once(tmp_path: Path, mus
     png = tmp_path / "dashboard.png"
     assert picture(muscle, png, at=8000.0) == []
     pixels = read_png(png)
-    assert pixels.shape[:2] == (1000, 1600)
+    assert pixels.shape[:2] == (964, 1600)
     # The middle: two loops; a loop and a density; a density.
     middle = pixels[40:820, 540:1190, :3].astype(int)
     cells = [cell for row in np.array_split(middle, 3) for cell in np.array_split(row, 2, axis=1)]
