@@ -217,7 +217,7 @@ class RtuLine(RepeatingLine):
                     problem = problem or error
                     self._in_step = False
         except RefusedError as error:
-            raise RefusalError(self._name, error.code, doing.format(number)) from error
+            raise RefusalError(self._name, exception_text(error.code, doing.format(number))) from error
         except OSError as error:
             self.lost = True
             raise lost_line(self._name, self._settings.port, error, ", then connect again") from error
@@ -283,9 +283,6 @@ class RtuLine(RepeatingLine):
 
 class RefusalError(DeviceError):
     """The instrument answered with a Modbus exception."""
-
-    def __init__(self, device: str, code: int, doing: str) -> None:
-        super().__init__(device, exception_text(code, doing))
 
 
 class Register(Generic[NumberT]):

@@ -237,7 +237,10 @@ class LocalStation(Station):
         if not others:
             raise error
         causes = ", ".join(f"{name} {what}" for name, what in sorted(others.items()))
-        raise type(error)(error.device, f"{error.text} ({causes} just before)") from error
+        # The error itself, as a driver's own class may be made in another way.
+        error.text = f"{error.text} ({causes} just before)"
+        error.args = (f"{error.device}: {error.text}",)
+        raise error
 
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
         self._away.add(name)

@@ -13,13 +13,15 @@ from sim_devices.torture.running import Bed, Task, faults_of, largest_excursion,
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 SUPPLY = str(EXAMPLES / "bench-supply.toml")
+BUSES = str(Path(__file__).parents[1] / "lines" / "buses.toml")
 PYMEASURE = str(EXAMPLES / "pymeasure-supply.toml")
 OVERRIDES = {"vo2": {"devices.tec.current_limit": "1.0"}}
 
 
 @cache
 def tortured(rig):
-    task = Task(rig, OVERRIDES.get(rig, {}))
+    # An interlock of the servos is within their range.
+    task = Task(rig, OVERRIDES.get(rig, {}), share=0.5 if rig == BUSES else 1.0)
     found = {seed: reference_of(task, seed) for seed in ((1, 4) if rig == "sma" else (0, 1))}
     return task, {seed: each.widened(found.values()) for seed, each in found.items()}
 
@@ -45,6 +47,7 @@ def cell(rig, fault, seed=1):
         ("sma", "load_cell.exchange"),
         ("sma", "load_cell.echo"),
         ("sma", "supply+load_cell.renumber"),
+        (BUSES, "load2+heater1.renumber"),
     ],
 )
 def test_a_run_with_a_fault_ends_safe_and_true(rig, fault):
