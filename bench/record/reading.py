@@ -278,7 +278,18 @@ class Record:
 
     def _blocks(self, table: str, after: int = -1) -> Iterator[list[tuple[Any, ...]]]:
         """Yield the rows with numbers beyond `after` in blocks."""
-        statement = f"SELECT * FROM {table} WHERE {NUMBERS[table]} > {after:d} ORDER BY 1"  # noqa: S608 - own names
+        # Columns by name, as only then a missing one is an error.
+        leading = {
+            "steps": ("started", "finished", "phase", "label", "settled", "setpoints"),
+            "telemetry": ("t", "step"),
+            "events": ("t", "level", "kind", "text"),
+        }[table]
+        signals = () if table == "events" else tuple(signal.name for signal in self.signals)
+        seen = ("seen",) if table == "steps" else ()
+        # The rows are numbered by their first column, from 0 or 1.
+        number = NUMBERS[table]
+        columns = ", ".join(map(quoted, (number, *leading, *signals, *seen, "checksum")))
+        statement = f"SELECT {columns} FROM {table} WHERE {number} > {after:d} ORDER BY 1"  # noqa: S608 - own names
         try:
             cursor = self._db.execute(statement)
             while rows := cursor.fetchmany(_BLOCK):

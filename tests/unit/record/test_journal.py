@@ -331,6 +331,8 @@ class TestUnusable:
             "DROP TABLE signals",
             "DROP TABLE steps",
             "ALTER TABLE steps DROP COLUMN force",
+            "ALTER TABLE telemetry RENAME COLUMN force TO other",
+            "ALTER TABLE events RENAME COLUMN kind TO other",
             "UPDATE steps SET setpoints = 'tec'",
             "UPDATE steps SET force = 'heavy'",
             "UPDATE steps SET label = CAST(x'ff' AS TEXT)",
