@@ -23,7 +23,7 @@ FIGURES = {
 }
 """By tutorial, the figures of its page and the file that is each of them."""
 COLORS = 64
-"""Of a figure: lines and labels need no more, and the file has a third of the size."""
+"""Colours of a figure: lines and labels need no more, and the file has a third of the size."""
 
 
 def main() -> None:

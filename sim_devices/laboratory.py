@@ -244,23 +244,22 @@ class EmulatedLaboratory:
 
     def _renumberings(self) -> dict[str, Fault]:
         """Return by `A+B.renumber` how each two serial lines that follow one another change places."""
-        serial = [name for name, server in self._servers.items() if isinstance(server, FaultySerial)]
+        serial = [(name, server) for name, server in self._servers.items() if isinstance(server, FaultySerial)]
         return {
-            f"{first}{JOIN}{second}.renumber": Fault(
-                f"the ports of {first} and {second} are lost, and come back with each other's number",
-                partial(self._exchange_ports, first, second),
+            f"{a}{JOIN}{b}.renumber": Fault(
+                f"the ports of {a} and {b} are lost, and come back with each other's number",
+                partial(self._exchange_ports, {a: first, b: second}),
                 {"seconds": Quantity(2.0, "s", 0.0, 3600.0, "time for which both are away")},
-                partial(self._exchange_ports, first, second, 0.0),
+                partial(self._exchange_ports, {a: first, b: second}, 0.0),
             )
-            for first, second in pairwise(serial)
+            for (a, first), (b, second) in pairwise(serial)
         }
 
-    def _exchange_ports(self, first: str, second: str, seconds: float) -> None:
-        ports = [self._servers[first], self._servers[second]]
-        assert isinstance(ports[0], FaultySerial)
-        assert isinstance(ports[1], FaultySerial)
-        ports[0].exchange_with(ports[1])
-        for name in (first, second):
+    def _exchange_ports(self, ports: Mapping[str, FaultySerial], seconds: float) -> None:
+        """Let two ports, by name, lead to each other's instrument, after a time for which both are away, s."""
+        first, second = ports.values()
+        first.exchange_with(second)
+        for name in ports:
             line = self.lines[name]
             line.break_off(Cable.UNPLUGGED)
             self.at(self._present() + seconds, partial(line.mend_from, Cable.UNPLUGGED))

@@ -115,7 +115,7 @@ class Span(NamedTuple):
 
 
 class Packet(NamedTuple):
-    """What one request of function 76 carries out: writes, then spans that are read, then the owner number."""
+    """One request of function 76, to be sent again and again: it writes, then reads spans and the owner number."""
 
     name: str
     """What it is called in messages."""

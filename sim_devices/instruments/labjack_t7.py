@@ -168,7 +168,7 @@ class Scan(Protocol):
         Parameters
         ----------
         scales : numpy.ndarray, shape (14, 4)
-            What a reading of each input is made of: noise, step, lowest and highest, V.
+            Noise, step, lowest and highest reading of each input, V.
         draw : callable
             Returns the next number of the standard normal distribution, one a conversion.
 

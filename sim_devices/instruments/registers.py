@@ -71,7 +71,7 @@ class Register:
 
 
 FrameParts = tuple[Sequence[Reader], Sequence[Register]]
-"""What one frame of a packet reads, and the registers that it writes."""
+"""Readers of one frame of a packet, and the registers that it writes."""
 
 
 class _Reads(NamedTuple):

@@ -112,7 +112,7 @@ def refusal(request: bytes, error: Exception) -> bytes:
 
 
 class Prepared(NamedTuple):
-    """What a request takes that comes again, with other values if it writes."""
+    """A request that is known, and may come again with other values if it writes."""
 
     size: int
     """Bytes of the request."""

@@ -31,8 +31,8 @@ _MOST_BYTES = 1034  # unit identifier and the longest PDU of a T7, whose packets
 
 
 _Known = tuple[int, bytes, bytes, Packet]
-"""Of a frame that comes again: its length, what ends it if that is always the same, what stands before the values of
-its reply from the protocol on, and what carries it out."""
+"""A known frame: its length, its end if that is always the same, the part of its reply before the values from the
+protocol on, and the function that carries it out."""
 
 
 class FramingError(Exception):

@@ -1,4 +1,4 @@
-"""What is wrong with each figure that is saved."""
+"""Problems of the figures that are saved."""
 
 from contextlib import contextmanager
 

@@ -112,7 +112,7 @@ fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 del sys.argv[0]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
-"""What makes its standard input the terminal of its session, and runs a script."""
+"""Program that makes its standard input the terminal of its session, and runs a script."""
 
 
 class Process:

@@ -12,6 +12,7 @@ from bench.analysis.figures.panels import Curve, plot_signals, time_axis
 from bench.analysis.report.recorded_run import RecordedRun
 from bench.base import Floats, with_unit
 from bench.devices import Signal
+from bench.rig import SETPOINT
 
 _RESET = "reset"
 """Begins the names of phases that only bring the memory into a known state."""
@@ -81,7 +82,7 @@ def draw_loops(folder: Path, ending: str, run: RecordedRun) -> Iterator[tuple[Pa
 
 def _is_left_alone(run: RecordedRun) -> bool:
     """Return whether a run of several steps has set-points that never change; one that was imported has none."""
-    names = [signal.name for signal in run.record.signals if signal.name.endswith("_setpoint")]
+    names = [signal.name for signal in run.record.signals if signal.name.endswith(SETPOINT)]
     return len(run.steps) > 1 and bool(names) and all(np.unique(run.steps[name]).size == 1 for name in names)
 
 

@@ -1,4 +1,4 @@
-"""What `bench list` shows is remembered, and said anew whenever something that it is made of changes."""
+"""`bench list` remembers what it shows, and makes it again when something that it is made of changes."""
 
 import json
 import os
