@@ -270,7 +270,7 @@ class TestTasks:
         (out / run / "notes.txt").write_text("mine")
         (out / model / "model.json").unlink()
         found = done_before(tasks, out)
-        assert found.lost == {run: ("journal.sqlite",), model: ("model.json",)}
+        assert found.lost == {run: "journal.sqlite", model: "model.json"}
         assert found.done.keys() == tasks.keys() - {run, model}
         capsys.readouterr()
         assert start(path, "--out", out, "--workers", 1) == 0

@@ -19,7 +19,6 @@ from typing import Any, Self
 from rich.console import Console
 
 from bench.base import ConfigurationError, DataError, TasksDisplay, needed_for, registry
-from bench.batch.campaign.execution import settled
 from bench.batch.campaign.sources import code_digest, content_of
 from bench.batch.campaign.tasks import UNFINISHED, CampaignTask, Done
 
@@ -121,7 +120,7 @@ class ClusterExecutor:
         task = self._tasks.pop(future.key)
         self._display.end()
         if future.status != "finished":
-            return task, settled(task, future.exception(), None)
+            return task, task.failed(future.exception())
         done, content = future.result()
         if content:
             unpacked(content, self._campaign / UNFINISHED / task.scratch, self._campaign / task.name)

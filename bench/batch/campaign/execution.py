@@ -5,12 +5,12 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Protocol
 
-from bench.base import AbortError, BenchError, ConfigurationError, Pending, Workers
+from bench.base import AbortError, ConfigurationError, Pending, Workers
 from bench.batch.campaign.tasks import DONE_NAME, SHOWN_DIGITS, UNFINISHED, CampaignTask, Done
 from bench.rig import Holder, Locks
 
@@ -49,21 +49,12 @@ class WorkersExecutor:
         self._pending[self._workers.submit(task.name, task.carry_out, self._campaign)] = task
 
     def next_done(self) -> tuple[CampaignTask, Done]:
-        """Wait for a task."""
+        """Wait for a task; raises AbortError if the operator has ended it, and so the campaign."""
         pending = self._workers.wait_for(self._pending)
         task, error = self._pending.pop(pending), pending.exception()
         if isinstance(error, AbortError):
             raise error
-        return task, settled(task, error, None if error else pending.result())
-
-
-def settled(task: CampaignTask, error: BaseException | None, done: Done | None) -> Done:
-    """Return what a task left, also where it has raised."""
-    if done is not None:
-        return done
-    if isinstance(error, BenchError):
-        return Done(task.identity, "refused", str(error))
-    return Done(task.identity, "crashed", f"{type(error).__name__}: {error}")
+        return task, task.failed(error) if error else pending.result()
 
 
 @contextmanager
@@ -91,8 +82,7 @@ class Before:
     done: dict[str, Done]  # by name of the task
     # By name of a task the one that it had then: what differs among the runs was something else.
     places: dict[str, str]
-    # By name of a task that has to be done again the files that have gone from its folder.
-    lost: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    lost: dict[str, str]  # by name of a task that has to be done again the file that has gone from its folder
 
     def put_in_place(self, campaign: Path) -> list[str]:
         """Rename the folders of tasks that have another name now, and of those that are not whole.
@@ -100,13 +90,10 @@ class Before:
         Returns a line for each task that is done again as its folder is not whole.
         """
         lines = []
-        for name, files in self.lost.items():
+        for name, file in self.lost.items():
             aside = _aside(campaign / name)
             (campaign / name).replace(aside)
-            what = "was not whole" if name in self.done else "is done again"
-            lines.append(
-                f"{name} {what}, as {' and '.join(files)} is gone; what was left is in {aside.name} beside it"
-            )
+            lines.append(f"{name} is done again, as {file} is gone; what was left is in {aside.name} beside it")
         for name, former in self.places.items():
             (campaign / name).parent.mkdir(parents=True, exist_ok=True)
             (campaign / former).replace(campaign / name)
@@ -121,19 +108,22 @@ def _aside(folder: Path) -> Path:
 
 def done_before(tasks: Mapping[str, CampaignTask], campaign: Path) -> Before:
     """Return what earlier starts have left of tasks in the folder of a campaign."""
-    found = {name: task.done_in(campaign / name) for name, task in tasks.items()}
-    done = {name: each for name, each in found.items() if each is not None}
-    missing = {task.identity[:SHOWN_DIGITS]: task for name, task in tasks.items() if name not in done}
-    places: dict[str, str] = {}
+    before = Before({}, {}, {})
+    missing: dict[str, CampaignTask] = {}
+    for name, task in tasks.items():
+        if (left := task.left_in(campaign / name)) is None:
+            missing[task.identity[:SHOWN_DIGITS]] = task
+        elif task.is_whole(campaign / name):
+            before.done[name] = left
+        else:
+            before.lost[name] = task.leaves
     for file in campaign.glob(f"*/*/{DONE_NAME}") if missing else ():
         former = file.parent.relative_to(campaign).as_posix()
-        task = missing.get(former[-SHOWN_DIGITS:])
-        if task is None or former in tasks or task.name in done:
-            continue
-        if (left := task.done_in(file.parent)) is not None:
-            done[task.name], places[task.name] = left, former
-    lost = {name: files for name, task in tasks.items() if (files := task.lost_in(campaign / name))}
-    return Before({name: done[name] for name in tasks if name in done}, places, lost)
+        moved = missing.get(former[-SHOWN_DIGITS:])
+        left = None if moved is None or former in tasks else moved.left_in(file.parent)
+        if moved is not None and left is not None and moved.is_whole(file.parent):
+            before.done[moved.name], before.places[moved.name] = left, former
+    return before
 
 
 def carry_out_tasks(tasks: Mapping[str, CampaignTask], done: dict[str, Done], executor: Executor) -> dict[str, Done]:

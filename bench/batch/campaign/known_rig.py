@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from bench.base import ConfigurationError, Stopwatch, VirtualClock
 from bench.batch.campaign.sources import PROGRAMS, digest, file_digest
-from bench.rig import Rig, RigDescription, RigFile, clock_for, load_rig, read_schedule, schedule_faults
+from bench.rig import Rig, RigDescription, clock_for, load_rig, read_schedule, schedule_faults
 
 _TICKS = 20
 """Seconds of laboratory time by which the speed of a rig is measured."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KnownRig:
     """An emulated rig with its overrides."""
 
-    file: RigFile  # what it was read from
-    description: RigDescription  # its devices and signals
+    description: RigDescription  # its file, devices and signals
     pace: float  # wall-clock seconds that a second of laboratory time takes here
     digest: str  # hash of the rig file with all overrides, and of the programs beside it
 
     @classmethod
-    def look_at(cls, name: str, overrides: Mapping[str, str]) -> KnownRig:
-        """Connect a rig.
+    def look_at(cls, name: str, overrides: tuple[tuple[str, str], ...]) -> KnownRig:
+        """Connect a rig with values by dotted key.
 
         Raises ConfigurationError if the rig file is wrong, or not all instruments are emulated; DeviceError if one
         cannot be connected.
         """
-        file = load_rig(name, overrides)
+        file = load_rig(name, dict(overrides))
         if not file.in_process:
             raise ConfigurationError("not all instruments are emulated; a campaign takes emulated rigs only")
         clock = clock_for(file, "virtual")
@@ -42,10 +40,10 @@ class KnownRig:
                 rig.measure()
             pace = stopwatch.seconds() / _TICKS
             programs = file_digest(Path(name), PROGRAMS) if name.endswith(".toml") else ""
-            return cls(file, rig.description, pace, digest([file.content, programs]))
+            return cls(rig.description, pace, digest([file.content, programs]))
 
     def check_faults(self, path: Path) -> None:
         """Check that a schedule can be read and the laboratory has its faults; raises ConfigurationError."""
-        make = self.file.laboratory
-        laboratory = make(self.file.laboratory_settings, VirtualClock(), 0) if make is not None else None
+        file = self.description.file
+        laboratory = file.laboratory(file.laboratory_settings, VirtualClock(), 0) if file.laboratory else None
         schedule_faults(laboratory, read_schedule(path), path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -99,12 +99,13 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> li
         if not isinstance(task, RunTask) or task.table != table:
             continue
         found = done[task.name]
-        row = _without_units(table=table, protocol=Path(task.protocol).name, rig=Path(task.rig).stem)
-        for key in expansion.varying[table]:
+        settings = task.settings
+        row = _without_units(table=table, protocol=settings["protocol"], rig=settings["rig"])
+        for key, unit in expansion.varying[table].items():
             if key not in ("protocol", "rig", "seed", "faults"):
-                value = task.setting(key)
+                value = settings[key]
                 plain = isinstance(value, (int, float, str)) and not isinstance(value, bool)
-                row[(key, expansion.units.get((table, key), ""))] = value if plain else str(value)
+                row[(key, unit)] = value if plain else str(value)
         row |= _without_units(faults=Path(task.faults).stem, seed=task.seed, status=found.status, reason=found.reason)
         row |= {(name, unit): value for name, (value, unit) in found.results.items()}
         for model in models.get(task.name, ()):
@@ -115,7 +116,7 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> li
     return rows
 
 
-def over_seeds(table: Sequence[Row], varying: Sequence[str]) -> list[Row]:
+def over_seeds(table: Sequence[Row], varying: Collection[str]) -> list[Row]:
     """Return median, worst (the greatest) and spread of each result over the seeds of a table of runs.
 
     A parameter that is a seed as well, such as `sequence_seed`, counts as one.
@@ -142,7 +143,7 @@ def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> list[Ro
     return rows
 
 
-def shown_columns(table: Sequence[Row], varying: Sequence[str]) -> list[Row]:
+def shown_columns(table: Sequence[Row], varying: Collection[str]) -> list[Row]:
     """Return the columns of a table of runs that people look at: what varies, and results."""
     left_out = {*_NOT_SHOWN, *({"protocol", "rig", "faults", "seed"} - {*varying})}
     if not any(row[("reason", "")] for row in table):

@@ -74,7 +74,7 @@ class Done:
         return self.status not in ("refused", "crashed")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CampaignTask(ABC):
     """One task.
 
@@ -87,10 +87,12 @@ class CampaignTask(ABC):
     """
 
     kind: ClassVar[str]
+    leaves: ClassVar[str] = ""
+    """The file in its folder that its results are in, for people and for other tasks; none if empty."""
     _not_described: ClassVar[tuple[str, ...]] = ()
 
-    name: str
-    identity: str
+    name: str = ""
+    identity: str = ""
 
     @property
     def scratch(self) -> str:
@@ -107,11 +109,6 @@ class CampaignTask(ABC):
         """The files that it reads, with the suffixes of those beside each that it may read as well."""
         return {}
 
-    @property
-    def leaves(self) -> tuple[str, ...]:
-        """The files in its folder that its results are in, for people and for other tasks."""
-        return ()
-
     def moved(self, places: Mapping[str, str]) -> CampaignTask:  # noqa: ARG002 - of a task without files
         """Return the same task with its files in other places, by their old path."""
         return self
@@ -119,19 +116,12 @@ class CampaignTask(ABC):
     def carry_out(self, campaign: Path) -> Done:
         """Carry it out in the folder of a campaign, and leave its folder there, whole or not at all.
 
-        Errors of the bench become a status, as they are a result of this task alone; that the operator ends it does
-        not.
+        Raises BenchError if it cannot be carried out.
         """
         scratch = campaign / UNFINISHED / self.scratch
         shutil.rmtree(scratch, ignore_errors=True)
         (scratch / "made").mkdir(parents=True)
-        try:
-            made, done = self._work(campaign, scratch / "made")
-        except AbortError:
-            # The operator ends the campaign; the next start does this task again.
-            raise
-        except BenchError as error:
-            return Done(self.identity, "refused", f"{error}{self._way_on(campaign, str(error))}")
+        made, done = self._work(campaign, scratch / "made")
         content = {"task": self.describe(), **asdict(done)}
         write_json_file(made / DONE_NAME, content)
         target = campaign / self.name
@@ -142,24 +132,21 @@ class CampaignTask(ABC):
         shutil.rmtree(scratch, ignore_errors=True)
         return done
 
-    def done_in(self, folder: Path) -> Done | None:
-        """Return what this task has left in a folder, or None if it is not the folder of this task, or not whole."""
-        found = self._said_in(folder)
-        return found if found is not None and not self._missing(folder) else None
+    def failed(self, error: BaseException) -> Done:
+        """Return what is left of this task, which has raised an error: how it ended, and how to go on."""
+        if not isinstance(error, BenchError):
+            return Done(self.identity, "crashed", f"{type(error).__name__}: {error}")
+        # What another task has left may be the reason.
+        wrong = next((name for name in self.needs if name in str(error)), None)
+        way_on = f"; remove {wrong} from the campaign, and the next start makes it again" if wrong else ""
+        return Done(self.identity, "refused", f"{error}{way_on}")
 
-    def lost_in(self, folder: Path) -> tuple[str, ...]:
-        """Return the files that this task has left in a folder and that are not there any more."""
-        return self._missing(folder) if self._said_in(folder) is not None else ()
+    def is_whole(self, folder: Path) -> bool:
+        """Return whether a folder that this task has left has the file with its results."""
+        return not self.leaves or (folder / self.leaves).is_file()
 
-    def _missing(self, folder: Path) -> tuple[str, ...]:
-        return tuple(name for name in self.leaves if not (folder / name).is_file())
-
-    def _way_on(self, campaign: Path, reason: str) -> str:
-        """Return how to go on if the reason why it was refused is what another task has left."""
-        wrong = next((name for name in self.needs if str(campaign / name) in reason), None)
-        return f"; remove {wrong} from the campaign, and the next start makes it again" if wrong else ""
-
-    def _said_in(self, folder: Path) -> Done | None:
+    def left_in(self, folder: Path) -> Done | None:
+        """Return what this task says that it has left in a folder, or None if it is not the folder of this task."""
         try:
             content = parse_json((folder / DONE_NAME).read_text(encoding="utf-8"))
             results = {
@@ -181,11 +168,12 @@ class CampaignTask(ABC):
         """Do it in the folder `made`; return the folder of what it has made, that or one in it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunTask(CampaignTask):
     """A run on an emulated rig, on the virtual clock."""
 
     kind = "run"
+    leaves = JOURNAL_NAME
 
     table: str  # name of the table that asks for it
     # As `bench run` takes them.
@@ -210,18 +198,13 @@ class RunTask(CampaignTask):
         return tuple(self.models.values())
 
     @property
-    def leaves(self) -> tuple[str, ...]:
-        """The journal."""
-        return (JOURNAL_NAME,)
-
-    @property
     def files(self) -> Mapping[Path, Sequence[str]]:
         """The files that its parameters name, the faults, the rig file and the protocol file."""
         found: dict[Path, Sequence[str]] = {Path(name): () for name in (*self.inputs, self.faults) if name}
         if self.rig.endswith(".toml"):
             found[Path(self.rig)] = PROGRAMS_AND_RIGS
         if ".py" in self.protocol:
-            found[Path(self.protocol.partition(".py")[0] + ".py")] = PROGRAMS
+            found[program_of(self.protocol)] = PROGRAMS
         return found
 
     def moved(self, places: Mapping[str, str]) -> CampaignTask:
@@ -243,10 +226,18 @@ class RunTask(CampaignTask):
         """Its name without the table and its identity."""
         return self.name.rpartition("/")[2].rpartition("-")[0]
 
-    def setting(self, key: str) -> Any:  # noqa: ANN401 - of a parameter, an override, or the label of a model
-        """Return what it has on an axis of its table."""
-        own = {"protocol": self.protocol, "faults": self.faults or "none"}
-        return {**own, **self.overrides, **self.parameters, **self.model_labels}[key]
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What it has on each axis of its table, by the name of the axis; of models their labels."""
+        return {
+            "protocol": Path(self.protocol).name,
+            "rig": Path(self.rig).stem,
+            **self.overrides,
+            **self.parameters,
+            **self.model_labels,
+            "faults": Path(self.faults).stem or "none",
+            "seed": self.seed,
+        }
 
     def run(self, campaign: Path, folder: Path) -> Run:
         """Return the run that it carries out; its record goes below `folder`."""
@@ -285,11 +276,12 @@ class RunTask(CampaignTask):
         return result.folder, Done(self.identity, outcome.status if outcome.is_safe else "unsafe", reason, results)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ModelTask(CampaignTask):
     """The identification of a model from a run, or from several together."""
 
     kind = "model"
+    leaves = MODEL_NAME
     _not_described = ("input", "output", "label")
 
     table: str  # name of the table that asks for it
@@ -306,11 +298,6 @@ class ModelTask(CampaignTask):
     def needs(self) -> tuple[str, ...]:
         """The runs."""
         return self.sources
-
-    @property
-    def leaves(self) -> tuple[str, ...]:
-        """The model."""
-        return (MODEL_NAME,)
 
     def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
         runs = [completed_run(campaign, name) for name in self.sources]
@@ -329,7 +316,7 @@ class ModelTask(CampaignTask):
         return made, Done(self.identity, "completed", "", results)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ComparisonTask(CampaignTask):
     """The errors of models on a run."""
 
@@ -364,20 +351,16 @@ class ComparisonTask(CampaignTask):
         return made, Done(self.identity, "completed", "", results)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StudyTask(CampaignTask):
     """A study with one seed."""
 
     kind = "study"
+    leaves = STUDY_NAME
 
     study: str  # name of a registered study
     rig: str  # another rig than the study's own; empty for that
     seed: int  # from which the seeds of its runs come
-
-    @property
-    def leaves(self) -> tuple[str, ...]:
-        """Values and tables."""
-        return (STUDY_NAME,)
 
     def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
         del campaign
@@ -393,6 +376,11 @@ class StudyTask(CampaignTask):
             if isinstance(value, (int, float)) and not isinstance(value, bool)
         }
         return made, Done(self.identity, "completed", "", results)
+
+
+def program_of(protocol: str) -> Path:
+    """Return the file of a protocol that is not a packaged one."""
+    return Path(protocol.partition(".py")[0] + ".py")
 
 
 def completed_run(campaign: Path, name: str) -> Path:
