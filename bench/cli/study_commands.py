@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bench.base import AbortError, ConfigurationError, print_plain
+from bench.base import AbortError, ConfigurationError, print_plain, write_result
 from bench.cli.command_support import (
     FigureFormatOption,
     JsonOption,
@@ -146,7 +146,8 @@ def campaign(
         return
     with ExitStack() as stack:
         stack.enter_context(_saying_how_to_go_on(folder))
-        stack.enter_context(opened_folder(folder, file.read_text(encoding="utf-8-sig")))
+        stack.enter_context(opened_folder(folder))
+        write_result(folder / "campaign.toml", file.read_text(encoding="utf-8-sig"))
         # Another process may have been at work here until it was locked.
         before = done_before(expansion.tasks, folder)
         for line in before.put_in_place(folder):

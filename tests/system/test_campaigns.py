@@ -355,7 +355,7 @@ class TestTasks:
 
     def test_one_process_at_a_time_works_in_a_folder(self, campaign, tmp_path, capsys):
         path, out = campaign(STAIRS), tmp_path / "out"
-        with opened_folder(out, ""):
+        with opened_folder(out):
             assert start(path, "--out", out, "--workers", 1) == 2
         assert "out is in use: " in capsys.readouterr().err
 

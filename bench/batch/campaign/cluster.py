@@ -12,14 +12,15 @@ import sys
 import tarfile
 import tempfile
 import threading
-from dataclasses import dataclass
+from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
 from rich.console import Console
 
 from bench.base import ConfigurationError, DataError, TasksDisplay, needed_for, registry
-from bench.batch.campaign.sources import code_digest, content_of
+from bench.batch.campaign.sources import code_digest, files_of
 from bench.batch.campaign.tasks import UNFINISHED, CampaignTask, Done
 
 _CONNECTING = 30
@@ -47,17 +48,6 @@ def check_address(address: str) -> None:
             "tls://HOST:PORT, with the certificates in dask's configuration (distributed.comm.tls), or "
             "tcp://127.0.0.1:PORT"
         )
-
-
-@dataclass(frozen=True)
-class Parcel:
-    """A task with all that it reads."""
-
-    task: CampaignTask
-    code: str  # hash of the programs with which it is meant to be carried out
-    folders: dict[str, bytes]  # the folders of the tasks that it needs, packed, by name
-    # By the path of a file that it reads, content by name, of those beside it as well.
-    files: dict[str, dict[str, bytes]]
 
 
 class ClusterExecutor:
@@ -106,10 +96,18 @@ class ClusterExecutor:
 
     def submit(self, task: CampaignTask) -> None:
         """Have a task carried out on any worker; the tasks of a worker that dies are done again."""
-        files = {str(path): content_of(path, beside) for path, beside in task.files.items()}
-        folders = {name: packed(self._campaign / name) for name in task.needs}
-        parcel = Parcel(task, code_digest(), folders, files)
-        future = self._client.submit(carry_out_parcel, parcel, key=f"{task.name}-{task.identity}", pure=False)
+        files = list(enumerate(task.files.items()))
+        places = {str(path): f"files/{number}/{path.name}" for number, (path, _) in files}
+        entries = (
+            (file, f"files/{number}/{file.name}")
+            for number, (path, beside) in files
+            for file in files_of(path, beside)
+        )
+        needs = ((self._campaign / name, f"campaign/{name}") for name in task.needs)
+        content = packed(chain(needs, entries))
+        future = self._client.submit(
+            carry_out_there, task, code_digest(), places, content, key=f"{task.name}-{task.identity}", pure=False
+        )
         self._tasks[future.key] = task
         self._completed.add(future)
         self._display.add()
@@ -122,51 +120,50 @@ class ClusterExecutor:
         if future.status != "finished":
             return task, task.failed(future.exception())
         done, content = future.result()
-        if content:
-            unpacked(content, self._campaign / UNFINISHED / task.scratch, self._campaign / task.name)
+        target, scratch = self._campaign / task.name, self._campaign / UNFINISHED / task.scratch
+        unpack(content, scratch)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        scratch.replace(target)
         future.release()
         return task, done
 
 
-def carry_out_parcel(parcel: Parcel) -> tuple[Done, bytes]:
-    """Carry a task out in a folder of its own; return what it left, and its folder, packed."""
-    if code_digest() != parcel.code:
+def carry_out_there(task: CampaignTask, code: str, places: dict[str, str], content: bytes) -> tuple[Done, bytes]:
+    """Carry a task out in a folder of its own; return what it left, and its folder, packed.
+
+    `code` is the hash of the programs with which it is meant to be carried out; `content` holds all that it reads,
+    its files in these places by their path.
+    """
+    if code_digest() != code:
         raise DataError("the worker has another version of the bench, or of a library, than the campaign")
-    with _ONE_AT_A_TIME, tempfile.TemporaryDirectory(prefix="bench-campaign-") as scratch:
-        campaign = Path(scratch) / "campaign"
-        for name, content in parcel.folders.items():
-            unpacked(content, campaign / UNFINISHED / "needs", campaign / name)
-        places: dict[str, str] = {}
-        for number, (path, files) in enumerate(parcel.files.items()):
-            folder = Path(scratch) / "files" / str(number)
-            folder.mkdir(parents=True)
-            for name, content in files.items():
-                (folder / name).write_bytes(content)
-            places[path] = str(folder / Path(path).name)
+    with _ONE_AT_A_TIME, tempfile.TemporaryDirectory(prefix="bench-campaign-") as name:
+        scratch = Path(name)
+        unpack(content, scratch)
         try:
-            done = parcel.task.moved(places).carry_out(campaign)
+            moved = task.moved({path: str(scratch / place) for path, place in places.items()})
+            done = moved.carry_out(scratch / "campaign")
         finally:
-            _forget(Path(scratch))
-        folder = campaign / parcel.task.name
-        return done, packed(folder) if folder.is_dir() else b""
+            _forget(scratch)
+        return done, packed([(scratch / "campaign" / task.name, ".")])
 
 
-def packed(folder: Path) -> bytes:
-    """Return the files of a folder as one."""
+def packed(entries: Iterable[tuple[Path, str]]) -> bytes:
+    """Return files and folders as one archive, each under a name; raises DataError if one cannot be read."""
     buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w") as archive:
-        archive.add(folder, arcname=".")
+    try:
+        with tarfile.open(fileobj=buffer, mode="w") as archive:
+            for path, name in entries:
+                archive.add(path, arcname=name)
+    except OSError as error:
+        raise DataError(f"{error.filename} cannot be read: {error.strerror}") from None
     return buffer.getvalue()
 
 
-def unpacked(content: bytes, scratch: Path, target: Path) -> None:
-    """Make a folder of what `packed` has returned, by way of another one, so that it is there whole or not at all."""
-    scratch.mkdir(parents=True, exist_ok=True)
+def unpack(content: bytes, folder: Path) -> None:
+    """Write what `packed` has returned into a folder; nothing can be written outside of it."""
+    folder.mkdir(parents=True, exist_ok=True)
     with tarfile.open(fileobj=io.BytesIO(content)) as archive:
-        # Nothing can be written outside of the folder.
-        archive.extractall(scratch, filter="data")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    scratch.replace(target)
+        archive.extractall(folder, filter="data")
 
 
 def _forget(folder: Path) -> None:

@@ -14,9 +14,6 @@ from bench.base import AbortError, ConfigurationError, Pending, Workers
 from bench.batch.campaign.tasks import DONE_NAME, SHOWN_DIGITS, UNFINISHED, CampaignTask, Done
 from bench.rig import Holder, Locks
 
-FILE_NAME = "campaign.toml"
-"""Copy of the campaign file in the folder of the campaign."""
-
 
 class Executor(Protocol):
     """Carries tasks out, many at a time."""
@@ -58,17 +55,16 @@ class WorkersExecutor:
 
 
 @contextmanager
-def opened_folder(campaign: Path, text: str) -> Iterator[None]:
-    """Hold the folder of a campaign meanwhile, for one process at a time; unfinished tasks are removed.
+def opened_folder(campaign: Path) -> Iterator[None]:
+    """Hold the folder of many runs meanwhile, for one process at a time; unfinished tasks are removed.
 
-    Raises ConfigurationError if another campaign is at work in it, or it cannot be written.
+    Raises ConfigurationError if another process is at work in it, or it cannot be written.
     """
-    with Locks(Holder.of_this_process("emulated", f"a campaign in {campaign.resolve()}")) as locks:
+    with Locks(Holder.of_this_process("emulated", f"many runs in {campaign.resolve()}")) as locks:
         try:
             campaign.mkdir(parents=True, exist_ok=True)
             locks.take_folder(campaign)
             shutil.rmtree(campaign / UNFINISHED, ignore_errors=True)
-            (campaign / FILE_NAME).write_text(text, encoding="utf-8")
         except OSError as error:
             raise ConfigurationError(f"the folder of the campaign cannot be made: {error}") from None
         yield

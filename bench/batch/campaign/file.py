@@ -1,38 +1,6 @@
 """A campaign file: which protocols run on which rigs, with which parameters, seeds and faults.
 
-A campaign file is TOML; `docs/reference/campaign.md` describes it::
-
-    [[runs]]                                # a grid: each protocol × rig × override × parameter × faults × seed
-    name = "characterize"
-    protocol = "damped-oscillation"
-    rigs = ["my-rig"]
-    seeds = "0..9"
-    [runs.parameters]
-    increment = [1.0, 2.0]                  # a list is an axis of the grid
-
-    [[models]]                              # a model identified from each of these runs
-    name = "density"
-    runs = "characterize"
-    model = "preisach-nonmonotonic"
-    levels = 20
-
-    [[runs]]
-    protocol = "tracking"
-    rigs = ["my-rig"]
-    seeds = "0..9"
-    [runs.parameters]
-    model = "@density"                      # that of the same rig and seed
-
-    [[comparisons]]                         # the errors of models on runs that they were not identified from
-    name = "validation"
-    runs = "validate"
-    models = ["density"]
-
-    [[studies]]                             # what `bench study` carries out
-    name = "my-study"
-    seeds = "0..9"
-
-Paths are relative to the file. Unknown keys are errors.
+`docs/reference/campaign.md` has an example of each table. Paths are relative to the file. Unknown keys are errors.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a campaign reads beside its own file: programs, rig files, faults, data; their hashes, and their content."""
+"""What a campaign reads beside its own file: programs, rig files, faults, data; their hashes."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ def code_digest() -> str:
     return digest(versions | {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files})
 
 
-def content_of(path: Path, beside: Collection[str] = ()) -> dict[str, bytes]:
-    """Return the content of a file by its name, and of those beside it with one of these suffixes.
-
-    Raises ConfigurationError if it cannot be read.
-    """
-    try:
-        others = (file for file in sorted(path.parent.iterdir()) if file.suffix in beside and file.is_file())
-        return {file.name: file.read_bytes() for file in (path, *others)}
-    except OSError as error:
-        raise ConfigurationError(f"{path} cannot be read: {error.strerror}") from None
+def files_of(path: Path, beside: Collection[str] = ()) -> list[Path]:
+    """Return a file, and those beside it with one of these suffixes; raises OSError if they cannot be listed."""
+    others = (file for file in sorted(path.parent.iterdir()) if file.suffix in beside and file.is_file())
+    return list(dict.fromkeys([path, *others]))
 
 
 def file_digest(path: Path, beside: Collection[str] = ()) -> str:
-    """Return the hash of `content_of` these; raises as that."""
-    return digest({name: hashlib.sha256(content).hexdigest() for name, content in content_of(path, beside).items()})
+    """Return the hash of a file, and of those beside it with one of these suffixes, by their names.
+
+    Raises ConfigurationError if one cannot be read.
+    """
+    try:
+        return digest({each.name: hashlib.sha256(each.read_bytes()).hexdigest() for each in files_of(path, beside)})
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be read: {error.strerror}") from None
