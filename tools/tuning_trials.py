@@ -52,7 +52,7 @@ READINGS = 5
 """Readings at each target of a muscle."""
 UNSEEN = 1000
 """Seed of the first session that no tuning has seen."""
-SEARCHED = ("count=20",)
+SEARCHED = {"count": "20"}
 """Settings of the search: fewer targets than in a session, for the sake of time."""
 LOOPS: Mapping[str, Mapping[str, Any]] = {
     "vo2": {"model": "preisach-nonmonotonic", "levels": 20, "plane": (30.0, 70.0)},

@@ -18,10 +18,9 @@ from bench.batch.tuning.search import (
     get,
     multiplied,
     perturbed_models,
-    put,
     search,
 )
-from bench.batch.tuning.tuning_runs import TuningTask, start_of
+from bench.batch.tuning.tuning_runs import start_of
 from bench.control import ControllerSetup, controller_spec, tuning_text
 from bench.control.tuning_file import load_tuning
 from bench.identification import ModelFile
@@ -92,8 +91,8 @@ def test_a_search_begins_with_the_numbers_of_the_rig_file_over_those_of_the_cont
     rig.write_text(f'extends = "vo2"\n{tables}\nclose_enough = 6\narrival = {{ tolerance = 0.02 }}\n')
     spec = controller_spec("target", "closed-loop-inverse")
     setup = ControllerSetup(model=ModelFile("preisach", FILM), limits=(21.0, 84.0))
-    task = TuningTask("tracking", "closed-loop-inverse", "response")
-    found = start_of(task, str(rig), spec.numbers(setup), spec.tunable)
+    table = load_rig(str(rig)).protocols["tracking"]["tuning"]["closed-loop-inverse"]
+    found = start_of(table, spec.numbers(setup), spec.tunable)
     assert (found["close_enough"], found["corrections"], found["arrival"]["tolerance"]) == (6.0, 4, 0.02)
     # What is given without decimals need not stay a whole number.
     assert [type(found[name]) for name in ("close_enough", "corrections")] == [float, int]
@@ -165,7 +164,7 @@ def test_the_cost_is_error_and_time_as_multiples_of_those_before():
     assert cost_of(2.0, 10.0, (4.0, 5.0)) == pytest.approx(0.5 + 0.25 * 2.0)
     assert cost_of(2.0, 10.0, (4.0, 5.0), time_weight=1.0) == pytest.approx(0.5 + 2.0)
     assert cost_of(math.inf, math.nan, (4.0, 5.0)) == FAILED
-    assert put(NUMBERS, "arrival.hold", 1.23456)["arrival"] == {"hold": 1.235}
+    assert multiplied(NUMBERS, "arrival.hold", 3.0864)["arrival"] == {"hold": 1.235}
 
 
 def test_other_gains_turn_about_the_middle_of_the_output():

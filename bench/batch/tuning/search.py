@@ -194,26 +194,27 @@ def _mean(trials: Sequence[TuningTrial]) -> TuningTrial:
 def multiplied(numbers: Numbers, name: str, factor: float) -> Numbers:
     """Return numbers with one of them, or those of `NAME+NAME`, multiplied by a factor.
 
-    A whole number stays one, and changes by 1 at least, but not to 0.
+    It is rounded to four digits. A whole number stays one, and changes by 1 at least, but not to 0.
     """
     for each in name.split("+"):
         number = get(numbers, each)
         value = factor * number
         if isinstance(number, int):
             value = max(1, math.ceil(value) if factor > 1.0 else math.floor(value))
+        elif math.isfinite(value):
+            value = float(f"{value:.4g}")
         numbers = put(numbers, each, value)
     return numbers
 
 
-def get(numbers: Numbers, name: str) -> float:
+def get(numbers: Numbers, name: str, default: float = math.nan) -> float:
     """Return a number by its name, `TABLE.NAME` for one in a table."""
     table, _, last = name.rpartition(".")
-    value: float = (numbers[table] if table else numbers)[last]
+    value: float = (numbers.get(table, {}) if table else numbers).get(last, default)
     return value
 
 
 def put(numbers: Numbers, name: str, value: float) -> Numbers:
-    """Return numbers with one of them replaced, rounded to four digits if it is no whole one."""
+    """Return numbers with one of them replaced."""
     table, _, last = name.rpartition(".")
-    rounded = value if isinstance(value, int) or not math.isfinite(value) else float(f"{value:.4g}")
-    return {**numbers, table: {**numbers[table], last: rounded}} if table else {**numbers, last: rounded}
+    return {**numbers, table: {**numbers.get(table, {}), last: value}} if table else {**numbers, last: value}

@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from bench.base import BenchError, ConfigurationError, PlainConsole, wall_time
+from bench.batch.campaign.execution import opened_folder
 from bench.batch.tuning.search import ERRORS, MARGIN, TIME_WEIGHT, WORST, TuningTrial, confirm, search
 from bench.batch.tuning.tuning_runs import TuningRuns, TuningTask, start_of, task_of
 from bench.control import ControllerSetup, controller_spec, tuning_text
@@ -86,19 +87,20 @@ def tune(
     shown = console or PlainConsole(quiet=True)
     file = load_model(model).at_rest()
     task = task_of(file, controller, protocol)
-    on = twin or load_rig(rig).rig.twin or rig
+    own = load_rig(rig)
+    on = twin or own.rig.twin or rig
     tuned_on = load_rig(on)
     if not tuned_on.in_process:
         raise ConfigurationError(
             f"rig {on} is not emulated: give --twin, such as a rig file that bench model twin has made"
         )
-    tables = (load_rig(rig).protocols.get(task.protocol) or {}).get("tuning", {})
+    tables = own.protocols.get(task.protocol, {}).get("tuning", {})
     spec = controller_spec(task.kind, controller)
     if spec.numbers is None:
         raise ConfigurationError(f"controller {controller} has no numbers that could be tuned")
     given = settings or {}
     low, high = file.model.first.input_range if file.model.kind == TwoStage.kind else file.operator.input_range
-    drive = load_rig(rig).roles.get("drive")
+    drive = own.roles.get("drive")
     setup = ControllerSetup(
         name=controller,
         model=file,
@@ -106,28 +108,23 @@ def tune(
         dwell=None if drive is None else drive.dwell,
         options={"duration": float(given.get("duration", 20.0))},
     )
-    begin = start_of(task, rig, spec.numbers(setup), spec.tunable)
+    begin = start_of(tables.get(controller, {}), spec.numbers(setup), spec.tunable)
     trials: list[TuningTrial] = []
 
     def tell(trial: TuningTrial) -> None:
         trials.append(trial)
-        text = f"{len(trials):3}  cost {trial.cost:.4g}  RMS {trial.rms:.4g}  {dict(trial.numbers)}"
-        shown.print(text)
+        shown.print(f"{len(trials):3}  cost {trial.cost:.4g}  RMS {trial.rms:.4g}  {dict(trial.numbers)}")
         if len(trials) == 1 and trial.failed:
-            begun = f"the search begins with numbers that fail: {runs.failures[0]}"
-            shown.print(begun)
+            shown.print(f"the search begins with numbers that fail: {runs.failures[0]}")
 
     # What each of many runs says of itself would hide what the search says.
     kernels = ("bench.models", "bench.control", *getattr(tuned_on.laboratory, "kernels", ()))
-    with Workers(workers, title=f"tune {controller}", kernels=kernels) as pool:
+    with opened_folder(folder), Workers(workers, title=f"tune {controller}", kernels=kernels) as pool:
         runs = TuningRuns(task, on, file, folder, pool, given, seeds, time_weight=time_weight)
         best = search(begin, spec.tunable, runs, tell, rounds)
         if best.failed:
             raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
-        unseen = [
-            replace(runs, folder=folder / f"check-{seed}", seeds=1, first_seed=seed)
-            for seed in range(seeds, seeds + checks)
-        ]
+        unseen = [replace(runs, seeds=1, first_seed=seed) for seed in range(seeds, seeds + checks)]
         first, best = confirm(trials, unseen)
     provenance: dict[str, str | float] = {
         "model": model.name,

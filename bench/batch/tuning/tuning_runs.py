@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.analysis import TargetResults
-from bench.base import AbortError, BenchError, ConfigurationError
-from bench.batch.study import RunSeries, reached_targets
-from bench.batch.tuning.search import GAIN_HIGH, MARGIN, TIME_WEIGHT, Numbers, TuningTrial, cost_of, perturbed_models
+from bench.analysis import TargetResults, target_results
+from bench.base import BenchError, ConfigurationError
+from bench.batch.campaign.execution import WorkersExecutor, carry_out_tasks
+from bench.batch.campaign.tasks import Done, RunTask
+from bench.batch.tuning.search import (
+    GAIN_HIGH,
+    MARGIN,
+    TIME_WEIGHT,
+    Numbers,
+    TuningTrial,
+    cost_of,
+    get,
+    perturbed_models,
+    put,
+)
 from bench.control import controller_spec
 from bench.identification import ModelFile
 from bench.models import TwoStage
+from bench.record import Record
 from bench.rig import load_rig
 
 if TYPE_CHECKING:
-    from bench.base import Pending, Workers
-    from bench.execution import RunResult
+    from bench.base import Workers
 
 _AS_IDENTIFIED = "as-identified"
 _TARGETS = "target"
@@ -58,19 +71,6 @@ def task_of(file: ModelFile, controller: str, protocol: str | None) -> TuningTas
     return TuningTask(chosen, controller, FORCE if chosen == "force-control" else "response")
 
 
-class Scale(NamedTuple):
-    """RMS error (output units) and seconds at a target by which costs are counted."""
-
-    identified: tuple[float, float]  # with the model as it is
-    others: tuple[float, float]  # the greatest with the models from which the specimen differs
-
-    @classmethod
-    def of(cls, identified: tuple[float, float], others: Sequence[tuple[float, float]]) -> Scale:
-        """Return that of the first numbers; what fails with them beside the model plays no part."""
-        good = [each for each in others if math.isfinite(each[0])] or [identified]
-        return cls(identified, (max(rms for rms, _ in good), max(seconds for _, seconds in good)))
-
-
 @dataclass
 class TuningRuns:
     """Carries out trials of a controller's numbers."""
@@ -83,17 +83,19 @@ class TuningRuns:
     settings: Mapping[str, str]  # further parameters of the protocol
     seeds: int = 1  # sessions of each run
     first_seed: int = 0  # seed of the first session; the others follow
-    scale: Scale | None = None  # by what the cost is counted; by the first trial if not given
+    # RMS error (output units) and seconds at a target by which the costs of each model are counted; those of the
+    # first trial if not given, the greatest of them for all models from which the specimen differs.
+    scales: Sequence[tuple[float, float]] = ()
     # Part of the RMS error of the first numbers that costs as much as their time, at least 0.
     time_weight: float = TIME_WEIGHT
     failures: list[str] = field(default_factory=list)
     _count: int = 0
 
     def __post_init__(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
         role = load_rig(self.rig).roles.get(self.task.slot)
         if role is None:
             raise ConfigurationError(f"rig {self.rig} does not bind [roles.{self.task.slot}]")
+        self._sessions = range(self.first_seed, self.first_seed + self.seeds)
         self._signal = role.signal or role.reading
         self._opened = controller_spec(self.task.kind, self.task.controller).own_error is not None
         self._models = {}
@@ -108,60 +110,68 @@ class TuningRuns:
         Raises BenchError if those of the first trial fail with the model as it is, AbortError if the operator ended a
         run.
         """
-        started = [(numbers, self._start(numbers)) for numbers in candidates]
-        return [self._trial(numbers, runs) for numbers, runs in started]
+        numbered = list(enumerate(candidates, self._count + 1))
+        self._count += len(candidates)
+        tasks = {task.name: task for number, numbers in numbered for task in self._tasks(number, numbers)}
+        done = carry_out_tasks(tasks, {}, WorkersExecutor(self.workers, self.folder))
+        if crashed := next((each.reason for each in done.values() if each.status == "crashed"), ""):
+            raise RuntimeError(crashed)
+        return [self._trial(number, numbers, done) for number, numbers in numbered]
 
-    def _start(self, numbers: Numbers) -> dict[tuple[str, int], Pending[RunResult]]:
-        self._count += 1
+    def _tasks(self, number: int, numbers: Numbers) -> Iterator[RunTask]:
+        """Yield the runs of a trial, of each model in each session."""
         tuning = json.dumps({self.task.controller: numbers})
-        found = {}
-        for seed in range(self.first_seed, self.first_seed + self.seeds):
-            for name, path in self._models.items():
+        for seed, (name, path) in itertools.product(self._sessions, self._models.items()):
+            settings = {"model": str(path), "controller": self.task.controller, "sequence_seed": str(seed + 1)}
+            if name == GAIN_HIGH and self.task.kind != _TARGETS:
+                # Targets are drawn from the range of the model.
+                settings["margin"] = f"{_WITHIN_REACH:g}"
+            if self._opened:
+                # It goes on where the model of another specimen does not hold.
+                settings["fallback"] = "open-loop"
+            yield RunTask(
+                name=_run_name(number, name, seed),
+                table="",
+                protocol=self.task.protocol,
+                rig=self.rig,
                 # The same noise and the same targets for all candidates.
-                campaign = RunSeries(
-                    self.rig, self.folder / f"{self._count:03}" / name, seed, live=False, workers=self.workers
-                )
-                settings = {"model": str(path), "controller": self.task.controller, "sequence_seed": str(seed + 1)}
-                if name == GAIN_HIGH and self.task.kind != _TARGETS:
-                    # Targets are drawn from the range of the model.
-                    settings["margin"] = f"{_WITHIN_REACH:g}"
-                if self._opened:
-                    # It goes on where the model of another specimen does not hold.
-                    settings["fallback"] = "open-loop"
-                found[name, seed] = campaign.start(
-                    self.task.protocol, {**self.settings, **settings, "tuning": tuning}
-                )
-        return found
+                seed=2 * seed,
+                parameters={**self.settings, **settings, "tuning": tuning},
+            )
 
-    def _trial(self, numbers: Numbers, runs: Mapping[tuple[str, int], Pending[RunResult]]) -> TuningTrial:
-        reached: dict[tuple[str, int], TargetResults | None] = {}
-        for key, run in runs.items():
-            try:
-                reached[key] = reached_targets(run.result(), self._signal)
-            except AbortError:
-                raise
-            except BenchError as error:
-                self.failures.append(f"{key[0]}, {dict(numbers)}: {error}")
-                reached[key] = None
-        scores: dict[str, list[tuple[float, float]]] = {}
-        for (name, seed), results in reached.items():
-            scores.setdefault(name, []).append(_score(results, reached[_AS_IDENTIFIED, seed]))
-        means: dict[str, tuple[float, float]] = {
-            name: tuple(np.mean(runs, axis=0).tolist()) for name, runs in scores.items()
-        }
-        rms, seconds = means.pop(_AS_IDENTIFIED)
-        worst = max(each for each, _ in means.values())
-        if self.scale is None:
+    def _trial(self, number: int, numbers: Numbers, done: Mapping[str, Done]) -> TuningTrial:
+        scores = np.empty((len(self._models), self.seeds, 2))
+        for i, seed in enumerate(self._sessions):
+            names = [_run_name(number, name, seed) for name in self._models]
+            nominal, *others = (self._reached(name, done[name]) for name in names)
+            scores[:, i] = [_score(each, nominal) for each in (nominal, *others)]
+        means = scores.mean(axis=1)
+        rms, seconds = means[0].tolist()
+        if not self.scales:
             if not math.isfinite(rms):
                 raise BenchError(f"the controller fails with the numbers to begin with: {self.failures[0]}")
-            self.scale = Scale.of((rms, seconds), list(means.values()))
-        scales = dict.fromkeys(means, self.scale.others) | {_AS_IDENTIFIED: self.scale.identified}
-        costs = {
-            name: float(np.mean([cost_of(*each, scales[name], self.time_weight) for each in runs]))
-            for name, runs in scores.items()
-        }
-        cost = 0.5 * (costs.pop(_AS_IDENTIFIED) + max(costs.values()))
-        return TuningTrial(numbers, cost, rms, seconds, worst)
+            # What fails with these numbers beside the model plays no part.
+            good = means[1:][np.isfinite(means[1:, 0])] if np.isfinite(means[1:, 0]).any() else means[:1]
+            self.scales = [(rms, seconds), *[tuple(good.max(axis=0).tolist())] * (len(means) - 1)]
+        costs = [
+            float(np.mean([cost_of(error, time, scale, self.time_weight) for error, time in of_model]))
+            for of_model, scale in zip(scores.tolist(), self.scales, strict=True)
+        ]
+        return TuningTrial(numbers, 0.5 * (costs[0] + max(costs[1:])), rms, seconds, float(means[1:, 0].max()))
+
+    def _reached(self, name: str, done: Done) -> TargetResults | None:
+        """Return what a run has reached; None if it was not completed."""
+        results = None
+        if done.status == "completed":
+            with Record(self.folder / name) as record:
+                results = target_results(record, self._signal)
+        if results is None:
+            self.failures.append(f"{name}: {done.reason or 'has no targets'}")
+        return results
+
+
+def _run_name(number: int, model: str, seed: int) -> str:
+    return f"{number:03}/{model}-seed={seed}"
 
 
 def _score(results: TargetResults | None, nominal: TargetResults | None) -> tuple[float, float]:
@@ -174,16 +184,11 @@ def _score(results: TargetResults | None, nominal: TargetResults | None) -> tupl
     return rms, float(results.seconds[within].mean())
 
 
-def start_of(task: TuningTask, rig: str, numbers: Any, tunable: Sequence[str]) -> Numbers:  # noqa: ANN401 - a dataclass
-    """Return the numbers from which the search begins: those of the rig file over those of the controller."""
-    table = dict((load_rig(rig).protocols.get(task.protocol) or {}).get("tuning", {}).get(task.controller, {}))
-    found: dict[str, Any] = dict(table)
+def start_of(table: Mapping[str, Any], numbers: Any, tunable: Sequence[str]) -> Numbers:  # noqa: ANN401 - a dataclass
+    """Return the numbers from which the search begins: those of the rig file's table over those of the controller."""
+    found: Numbers = dict(table)
     for name in (each for together in tunable for each in together.split("+")):
-        outer, _, inner = name.rpartition(".")
-        default = getattr(getattr(numbers, outer) if outer else numbers, inner)
-        within = dict(found.get(outer, {})) if outer else found
+        default = attrgetter(name)(numbers)
         # What a rig file gives without decimals need not be a whole number.
-        within[inner] = type(default)(within.get(inner, default))
-        if outer:
-            found[outer] = within
+        found = put(found, name, type(default)(get(found, name, default)))
     return found
