@@ -19,6 +19,11 @@ from .designs import (
 )
 from .export.run_export import (
     export_run as export_run,
+    write_table as write_table,
+)
+from .export.typed_tables import (
+    Column as Column,
+    TypedTable as TypedTable,
 )
 from .figures.canvas import (
     check_matplotlib as check_matplotlib,

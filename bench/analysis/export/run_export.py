@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -52,12 +53,7 @@ def export_run(run: Path, format_: str, out: Path | None, *, escape_formulas: bo
         paths = []
         for name, table in typed_tables(record).items():
             paths.append(folder / f"{name}.{format_}")
-            if format_ == "csv":
-                heads = [column.head for column in table.columns]
-                blocks = ([list(map(_cell, values)) for values in block] for block in table.blocks)
-                write_blocks(paths[-1], heads, blocks, escape_formulas=escape_formulas)
-            else:
-                _write_parquet(paths[-1], table, metadata)
+            write_table(paths[-1], table, metadata, escape_formulas=escape_formulas)
     if format_ == "csv":
         paths.append(folder / "metadata.json")
         write_json_file(paths[-1], metadata)
@@ -114,7 +110,16 @@ def _pyarrow() -> Any:  # noqa: ANN401 - a module
     return pa
 
 
-def _write_parquet(path: Path, table: TypedTable, metadata: dict[str, Any]) -> None:
+def write_table(path: Path, table: TypedTable, metadata: Mapping[str, Any], *, escape_formulas: bool = True) -> None:
+    """Write a table as CSV, or as Parquet with the metadata if the name ends so; raise DataError if that fails.
+
+    Raises MissingExtraError for Parquet without pyarrow.
+    """
+    if path.suffix == ".csv":
+        heads = [column.head for column in table.columns]
+        blocks = ([list(map(_cell, values)) for values in block] for block in table.blocks)
+        write_blocks(path, heads, blocks, escape_formulas=escape_formulas)
+        return
     pa = _pyarrow()
     types = {
         "integer": pa.int64(),

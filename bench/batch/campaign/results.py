@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -9,14 +10,12 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from bench.analysis import write_csv
-from bench.base import MissingExtraError, header_with_unit, needed_for, print_plain, write_result
+from bench.analysis import Column, TypedTable, write_table
+from bench.base import MissingExtraError, header_with_unit, print_plain, print_table, write_result
 from bench.batch.campaign.expansion import Expansion
 from bench.batch.campaign.study_tables import MARKDOWN_NAME, print_over_seeds
-from bench.batch.campaign.tasks import ComparisonTask, Done, ModelTask, RunTask, StudyTask
+from bench.batch.campaign.tasks import ComparisonTask, Done, ModelTask, Results, RunTask, StudyTask
 
 Cell: TypeAlias = float | int | str | None
 Row: TypeAlias = dict[tuple[str, str], Cell]
@@ -27,7 +26,6 @@ MOST_ROWS = 40
 _NOT_GROUPED = ("steps", "laboratory_time", "wall_time", "folder")
 _NOT_SHOWN = ("steps", "wall_time", "folder", "table")
 MEDIAN, WORST, SPREAD = "median", "worst", "spread"
-_PLAIN = ("", "1")
 ERRORS = ("max", "rms")
 """What a comparison gives of each model."""
 
@@ -38,45 +36,27 @@ def columns_of(table: Sequence[Row]) -> dict[tuple[str, str], list[Cell]]:
     return {key: [row.get(key) for row in table] for key in keys}
 
 
-def head_of(column: tuple[str, str]) -> str:
-    """Return the head of a column, its unit in brackets."""
-    name, unit = column
-    return header_with_unit(name, "" if unit in _PLAIN else unit)
-
-
-def write_table_csv(table: Sequence[Row], path: Path) -> None:
-    """Write a table as CSV; raises DataError if that fails."""
-    columns = columns_of(table).items()
-    write_csv(path, [(head_of(key), ["" if cell is None else cell for cell in cells]) for key, cells in columns])
-
-
-def write_table_parquet(table: Sequence[Row], path: Path) -> None:
-    """Write a table as Parquet, with the unit of each column in its metadata; raises MissingExtraError."""
-    with needed_for("a Parquet file", "report"):
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-    fields, arrays = [], []
-    for key, cells in columns_of(table).items():
+def typed(table: Sequence[Row]) -> TypedTable:
+    """Return a table as it is written to files; a column of mixed cells is one of texts."""
+    heads, values = [], []
+    for (name, unit), cells in columns_of(table).items():
         kinds = {type(cell) for cell in cells if cell is not None}
-        kind = pa.int64() if kinds <= {int} else pa.float64() if kinds <= {int, float} else pa.string()
-        values = cells if kinds <= {int, float} else [None if cell is None else str(cell) for cell in cells]
-        fields.append(pa.field(head_of(key), kind, metadata={"unit": key[1]}))
-        arrays.append(pa.array(values, kind))
-    pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), path)
+        kind: Literal["integer", "number", "text"] = (
+            "integer" if kinds <= {int} else "number" if kinds <= {int, float} else "text"
+        )
+        heads.append(Column(name, unit, kind, ""))
+        values.append([str(cell) if kind == "text" and cell is not None else cell for cell in cells])
+    return TypedTable(tuple(heads), iter([values]))
 
 
 def print_first_rows(table: Sequence[Row], title: str, console: Console) -> None:
-    """Print the first rows of a table."""
-    printed = Table(title=title, title_justify="left")
+    """Print the first rows of a table, the numbers at its right end aligned right."""
     columns = columns_of(table)
-    for key, cells in columns.items():
-        # Units stand in brackets, which are no markup; a head breaks between words.
-        justify: Literal["right", "left"] = "right" if _is_numeric(cells) else "left"
-        printed.add_column(Text(head_of(key).replace("_", " ")), justify=justify, overflow="fold")
-    for row in table[:MOST_ROWS]:
-        printed.add_row(*(Text(shown(row.get(key))) for key in columns))
-    console.print(printed)
+    texts = [i for i, cells in enumerate(columns.values(), start=1) if not _is_numeric(cells)]
+    rows = [[shown(row.get(key)) for key in columns] for row in table[:MOST_ROWS]]
+    # A head breaks between words.
+    heads = [header_with_unit(*key).replace("_", " ") for key in columns]
+    print_table(console, heads, rows, title, numbers_from=max(texts, default=0))
     if len(table) > MOST_ROWS:
         console.print(f"… and {len(table) - MOST_ROWS} rows more")
 
@@ -107,10 +87,9 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> li
                 plain = isinstance(value, (int, float, str)) and not isinstance(value, bool)
                 row[(key, unit)] = value if plain else str(value)
         row |= _without_units(faults=Path(task.faults).stem, seed=task.seed, status=found.status, reason=found.reason)
-        row |= {(name, unit): value for name, (value, unit) in found.results.items()}
+        row |= _with_units(found.results)
         for model in models.get(task.name, ()):
-            left = done[model.name].results if model.name in done else {}
-            row |= {(f"{model.table}_{name}", unit): value for name, (value, unit) in left.items()}
+            row |= _with_units(done[model.name].results, f"{model.table}_")
         row[("folder", "")] = task.name
         rows.append(row)
     return rows
@@ -136,10 +115,7 @@ def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> list[Ro
             continue
         for model in task.models:
             row = _without_units(comparison=task.table, model=model, run=task.source)
-            for what in ERRORS:
-                value, unit = found[f"{model}_{what}"]
-                row[(what, unit)] = value
-            rows.append(row)
+            rows.append(row | _with_units({what: found[f"{model}_{what}"] for what in ERRORS}))
     return rows
 
 
@@ -225,13 +201,10 @@ def show_results(expansion: Expansion, done: Mapping[str, Done], folder: Path, c
 def write_tables(tables: Mapping[str, Sequence[Row]], folder: Path, console: Console) -> list[Path]:
     """Write tables as CSV and Parquet files by their name; without pyarrow as CSV only, which is said once."""
     paths = []
-    for name, table in tables.items():
-        paths.append(folder / f"{name}.csv")
-        write_table_csv(table, paths[-1])
     try:
-        for name, table in tables.items():
-            write_table_parquet(table, folder / f"{name}.parquet")
-            paths.append(folder / f"{name}.parquet")
+        for suffix, (name, table) in itertools.product(("csv", "parquet"), tables.items()):
+            write_table(folder / f"{name}.{suffix}", typed(table), {})
+            paths.append(folder / f"{name}.{suffix}")
     except MissingExtraError as error:
         print_plain(console, f"no Parquet files: {error}")
     return paths
@@ -266,6 +239,11 @@ def _over(
             row[(f"{prefix}{SPREAD}", unit)] = max(values) - min(values) if values else None
         rows.append(row)
     return rows
+
+
+def _with_units(results: Results, prefix: str = "") -> Row:
+    """Return results as cells; a plain number has no unit."""
+    return {(prefix + name, "" if unit == "1" else unit): value for name, (value, unit) in results.items()}
 
 
 def _without_units(**cells: Cell) -> Row:
