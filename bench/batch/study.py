@@ -80,7 +80,7 @@ class RunSeries:
     settings : mapping of str to mapping of str to str
         Parameters that are set in each run of a protocol, by the name of the protocol.
     started : list of Pending
-        The runs that were started so far, in the parts of this campaign as well.
+        The runs that were started so far, by this campaign and its parts.
     """
 
     rig: str
@@ -94,7 +94,6 @@ class RunSeries:
     started: list[Pending[RunResult]] = field(default_factory=list)
     _recordings: dict[Path, Pending[list[Path]]] = field(default_factory=dict)
     _seeds: Iterator[int] = field(init=False)
-    _whole: RunSeries | None = None
 
     def __post_init__(self) -> None:
         (self.folder / "figures").mkdir(parents=True, exist_ok=True)
@@ -102,12 +101,7 @@ class RunSeries:
 
     def part(self, name: str, rig: str) -> RunSeries:
         """Return a campaign on another rig, in a folder of its own below this one."""
-        return replace(self, rig=rig, folder=self.folder / name, started=[], _whole=self)
-
-    @property
-    def runs(self) -> list[RunResult]:
-        """The runs of this campaign in the order in which they were started; waits for those that go on."""
-        return [run.result() for run in self.started]
+        return replace(self, rig=rig, folder=self.folder / name)
 
     def start(
         self,
@@ -136,8 +130,6 @@ class RunSeries:
             live=self.live,
         )
         self.started.append(run)
-        if self._whole is not None:
-            self._whole.started.append(run)
         return run
 
     def calibrated_rig(self, calibrations: Mapping[str, Calibration], tables: str, *, rig: str | None = None) -> str:
@@ -423,13 +415,14 @@ def reproduce(
         campaign = RunSeries(on, folder, seed, live, pool, figure_format, recorded, settings)
         found = study.carry_out(campaign)
         recordings = campaign.recordings()
-    carried_out = {RunFolder(run.folder).meta["protocol"] for run in campaign.runs if settings}
+    runs = [run.result() for run in campaign.started]
+    carried_out = {RunFolder(run.folder).meta["protocol"] for run in runs if settings}
     for protocol in settings.keys() - carried_out:
         print_plain(console, f"note: parameters of {protocol} are set, but the study has no run of it")
     values = {
         "seed": seed,
         **found.values,
-        "laboratory_seconds": sum(run.outcome.laboratory_seconds for run in campaign.runs),
+        "laboratory_seconds": sum(run.outcome.laboratory_seconds for run in runs),
         "wall_seconds": stopwatch.seconds(),
         "folder": str(campaign.folder),
         "figures": [str(path) for path in found.figures],
@@ -438,7 +431,10 @@ def reproduce(
     for table in found.tables:
         table.print(values, console)
         console.print()
-    _print_end(found.verdict, values, console)
+    time = f"{values['laboratory_seconds'] / 3600:.1f} h of laboratory time in {values['wall_seconds']:.1f} s"
+    for line in (*(line.format_map(values) for line in found.verdict), f"time: {time} (paper: not stated)"):
+        print_plain(console, line)
+    print_plain(console, f"next: `bench runs {values['folder']}` lists the runs; figures and recordings are there")
     return values
 
 
@@ -457,11 +453,3 @@ def reached_targets(run: RunResult, signal: str) -> TargetResults:
 def true_errors(errors: Floats) -> dict[str, float]:
     """Return `true_max` and `true_rms` of errors against a true quantity, in its unit."""
     return {"true_max": float(np.abs(errors).max()), "true_rms": float(np.sqrt(np.mean(errors**2)))}
-
-
-def _print_end(verdict: Sequence[str], values: Mapping[str, Any], console: Console) -> None:
-    laboratory, wall = values["laboratory_seconds"], values["wall_seconds"]
-    time = f"time: {laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s (paper: not stated)"
-    for line in (*(line.format_map(values) for line in verdict), time):
-        print_plain(console, line)
-    print_plain(console, f"next: `bench runs {values['folder']}` lists the runs; figures and recordings are there")

@@ -125,12 +125,12 @@ class _Expander:
         self._models: dict[str, dict[tuple[str, int], list[ModelTask]]] = {}
         self._plans: dict[str, tuple[float, float]] = {}
         self._varying: dict[str, dict[str, str]] = {}
+        self._asked_runs = 0
         self._kernels = ["bench.models", "bench.identification"]
 
     def expansion(self) -> Expansion:
         """Return all tasks, those of runs in an order in which their models come before them."""
         file = self._file
-        self._check_number()
         for number, models in enumerate(file.tables.models):
             self._check_models(number, models)
         # A table of models comes after its runs, and before those that use it.
@@ -150,19 +150,6 @@ class _Expander:
                 f"{file.tables.most_runs}"
             )
         return Expansion(self._tasks, self._varying, self._plans, tuple(self._kernels))
-
-    def _check_number(self) -> None:
-        """Check the number of runs before any list of them is made."""
-        total = 0
-        for number, table in enumerate(self._file.tables.runs):
-            grid = [*axes(table.parameters).values(), *axes(dotted(table.overrides)).values()]
-            lengths = [len(table.protocol), len(table.rigs), len(table.seeds), len(table.faults), *map(len, grid)]
-            total += math.prod(lengths)
-            if total > self._file.tables.most_runs:
-                raise ConfigurationError(
-                    f"{self._file.where('runs', number)}: {' × '.join(map(str, lengths))} runs make {total} with "
-                    f"those before; most_runs = {self._file.tables.most_runs} are allowed"
-                )
 
     def _check_models(self, number: int, table: ModelsTable) -> None:
         where = self._file.where("models", number)
@@ -200,15 +187,21 @@ class _Expander:
             for key, values in grid.items():
                 if not values:
                     raise ConfigurationError(f"{where}: {kind}.{key} = []: expected at least one value")
-        of_models = {key for key, values in parameters.items() if self._has_several_models(where, key, values)}
         lengths = {
             "protocol": len(table.protocol),
             "rig": len(table.rigs),
-            **{key: len(values) + (key in of_models) for key, values in {**parameters, **overrides}.items()},
+            **{key: len(values) for key, values in {**parameters, **overrides}.items()},
             "faults": len(table.faults),
             "seed": len(table.seeds),
         }
-        self._varying[table.label] = {key: "" for key, length in lengths.items() if length > 1}
+        self._asked_runs += math.prod(lengths.values())
+        if self._asked_runs > (most := self._file.tables.most_runs):
+            raise ConfigurationError(
+                f"{where}: {' × '.join(map(str, lengths.values()))} runs make {self._asked_runs} with those before; "
+                f"most_runs = {most} are allowed"
+            )
+        of_models = {key for key, values in parameters.items() if self._has_several_models(where, key, values)}
+        self._varying[table.label] = {key: "" for key, length in lengths.items() if length > 1 or key in of_models}
         self._runs[table.label] = []
         for protocol, rig in itertools.product(table.protocol, table.rigs):
             for replaced, chosen in itertools.product(_grid(overrides), _grid(parameters)):
