@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,36 +49,66 @@ def draw_signals(path: Path, run: RecordedRun) -> str:
     return caption + (f" Constant: {', '.join(constant)}." if constant else "")
 
 
-def draw_loops(folder: Path, ending: str, run: RecordedRun) -> Iterator[tuple[Path, str]]:
-    """Draw the loops of the dashboard's layout, without the resets; yield their files and captions.
+class Loop(NamedTuple):
+    """A loop of the dashboard's layout, one point a reading; in units of the signals."""
+
+    input: Signal
+    output: Signal
+    inputs: Floats
+    outputs: Floats
+    phases: list[str]  # of each point
+    is_whole: bool  # whether no resets were left out
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """The labels of its axes."""
+        return with_unit(self.input.name, self.input.display.unit), with_unit(
+            self.output.name, self.output.display.unit
+        )
+
+    def curve(self, shown: Loop) -> Curve:
+        """Return its points in the units in which another one is shown."""
+        return Curve("", shown.input.display.factor * self.inputs, shown.output.display.factor * self.outputs)
+
+
+def loops_of(run: RecordedRun) -> list[Loop]:
+    """Return the loops of the dashboard's layout, without the resets.
 
     A loop at a fixed rate is one step of many ticks, which are its samples. A run in which nothing was set, such as a
     calibration by hand, has no loops.
     """
-    steps, summary, found = run.steps, run.summary, run.phases
-    samples, over, remark = (steps, "finished", "") if len(steps) > 1 else (summary.shown, "t", summary.remark)
+    steps, phases = run.steps, run.phases
+    samples, over = (steps, "finished") if len(steps) > 1 else (run.summary.shown, "t")
     layout = run.meta.get("dashboard")
     if not layout or not len(samples) or _is_left_alone(run):
-        return
+        return []
     signals = {signal.name: signal for signal in run.record.signals}
-    phase = np.searchsorted([each.start for each in found], samples[over], side="right") - 1
-    is_reset = np.array([each.name.startswith(_RESET) for each in found])[phase]
-    for i, pair in enumerate([layout, *layout.get("loops", ())]):
-        ends = [signals[name] for name in (pair["input"], pair["output"]) if name in signals]
-        if len(ends) < 2:
+    phase = np.searchsorted([each.start for each in phases], samples[over], side="right") - 1
+    is_reset = np.array([each.name.startswith(_RESET) for each in phases])[phase]
+    found = []
+    for pair in [layout, *layout.get("loops", ())]:
+        if not {pair["input"], pair["output"]} <= signals.keys():
             continue
-        inputs, outputs = (each.display.factor * samples[each.name] for each in ends)
+        inputs, outputs = samples[pair["input"]], samples[pair["output"]]
         known = np.isfinite(inputs) & np.isfinite(outputs)
         rows = known & ~is_reset
         rows = rows if rows.any() else known
-        if not rows.any():
-            continue
+        if rows.any():
+            ends = signals[pair["input"]], signals[pair["output"]]
+            names = [phases[k].name for k in phase[rows]]
+            found.append(Loop(*ends, inputs[rows], outputs[rows], names, not (known & ~rows).any()))
+    return found
+
+
+def draw_loops(folder: Path, ending: str, run: RecordedRun) -> Iterator[tuple[Path, str]]:
+    """Draw the loops of a run; yield their files and captions."""
+    remark = run.summary.remark if len(run.steps) <= 1 else ""
+    for i, loop in enumerate(loops_of(run)):
         path = folder / f"loop{f'-{i}' if i else ''}.{ending}"
-        labels = [with_unit(each.name, each.display.unit) for each in ends]
-        named = [found[k].name for k in phase[rows]]
-        plot_loops(path, inputs[rows], outputs[rows], input_label=labels[0], output_label=labels[1], phases=named)
-        left_out = " Resets are left out." if (known & ~rows).any() else ""
-        yield path, f"{ends[1].name} over {ends[0].name}, one point a reading.{left_out} {remark}".rstrip()
+        _, inputs, outputs = loop.curve(loop)
+        plot_loops(path, inputs, outputs, input_label=loop.labels[0], output_label=loop.labels[1], phases=loop.phases)
+        left_out = "" if loop.is_whole else " Resets are left out."
+        yield path, f"{loop.output.name} over {loop.input.name}, one point a reading.{left_out} {remark}".rstrip()
 
 
 def _is_left_alone(run: RecordedRun) -> bool:

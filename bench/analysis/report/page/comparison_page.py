@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from bench.analysis.figures.panels import Curve, plot_panels, plot_signals
 from bench.analysis.report.page.pages import Page, PageFigure, PageSection, inlined
+from bench.analysis.report.recorded_run import RecordedRun
+from bench.analysis.report.run_figures import loops_of
 from bench.analysis.run_comparison import RunComparison
 from bench.base import fitting_prefix, with_unit
 from bench.record import Record, Table
@@ -18,12 +20,12 @@ from bench.record import Record, Table
 def comparison_page(first: Record, second: Record, found: RunComparison) -> Page:
     """Return the page of two runs: how they ended, what tells them apart, and how far their signals are apart."""
     first_run, second_run = found.outcomes
-    tables = first.steps(), second.steps()
+    runs = RecordedRun.of(first), RecordedRun.of(second)
     sections = found.sections()
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
-        sections["Signals"] += _differences(found, tables, scratch)
-        sections["Loops"] = [*_loops(first, tables, scratch)]
+        sections["Signals"] += _differences(found, [run.steps for run in runs], scratch)
+        sections["Loops"] = [*_loops(runs, scratch)]
     unfinished = "unfinished" in (first_run.status, second_run.status)
     lead = [f"{first_run.run}, {first_run.status}, beside {second_run.run}, {second_run.status}."]
     if unfinished:
@@ -38,36 +40,17 @@ def comparison_page(first: Record, second: Record, found: RunComparison) -> Page
     )
 
 
-def _loops(record: Record, tables: Sequence[Table], scratch: Path) -> list[PageFigure]:
-    layout = record.meta.get("dashboard")
-    if not layout:
-        return []
-    figures = []
-    for i, pair in enumerate([layout, *layout.get("loops", ())]):
-        ends = pair["input"], pair["output"]
-        if not all(name in table.columns and np.isfinite(table[name]).any() for table in tables for name in ends):
-            continue
-        factors, labels = [], []
-        for name in ends:
-            greatest = max(float(np.nanmax(np.abs(table[name]))) for table in tables)
-            factor, unit = fitting_prefix(record.unit(name), greatest)
-            factors.append(factor)
-            labels.append(with_unit(name, unit))
-        path = scratch / f"loop-{i}.svg"
-        titles = ("first", "second")
-        plot_panels(
-            path,
-            {
-                title: [Curve("", factors[0] * table[ends[0]], factors[1] * table[ends[1]])]
-                for title, table in zip(titles, tables, strict=True)
-            },
-            horizontal_label=labels[0],
-            vertical_label=labels[1],
-            measured=titles,
-        )
-        caption = f"{ends[1]} over {ends[0]} in both runs, on the same axes."
-        figures.append(PageFigure(inlined(path, caption), caption))
-    return figures
+def _loops(runs: Sequence[RecordedRun], scratch: Path) -> Iterator[PageFigure]:
+    """Draw the loops that both runs have."""
+    ours, theirs = ({(loop.input.name, loop.output.name): loop for loop in loops_of(run)} for run in runs)
+    for i, (ends, first) in enumerate(ours.items()):
+        if ends in theirs:
+            path = scratch / f"loop-{i}.svg"
+            curves = {"first": [first.curve(first)], "second": [theirs[ends].curve(first)]}
+            horizontal, vertical = first.labels
+            plot_panels(path, curves, horizontal_label=horizontal, vertical_label=vertical, measured=[*curves])
+            caption = f"{ends[1]} over {ends[0]} in both runs, on the same axes."
+            yield PageFigure(inlined(path, caption), caption)
 
 
 def _differences(found: RunComparison, tables: Sequence[Table], scratch: Path) -> list[PageFigure]:

@@ -133,6 +133,10 @@ def test_a_calibrated_rig_and_the_one_message_for_each_calibration_that_does_not
     _, out, _ = bench("report", run)
     assert "signals.png" in out
     assert "loop.png" not in out
+    both = tmp_path / "both.html"
+    assert bench("runs", "compare", run, run, "--html", both)[0] == 0
+    assert 'id="signals"' in both.read_text()
+    assert 'id="loops"' not in both.read_text()
     for options in (("--interval", 365), ("--uncertainty", -1, "--interval", 365), ("--uncertainty", 1)):
         code, _, err = bench("rig", "calibrate", run, "--sensor", "psd_position", "--unit", "°", *options)
         assert code
