@@ -164,8 +164,8 @@ def compare_runs(first: Record, second: Record) -> RunComparison:
 
 
 def _reproducibility(first: Record, second: Record) -> dict[str, float]:
-    output = str(first.meta.get("controls", ""))
-    if not output or second.meta.get("controls") != output:
+    output = first.controlled
+    if not output or second.controlled != output:
         return {}
     ours, theirs = target_results(first, output), target_results(second, output)
     if ours is None or theirs is None or not np.array_equal(ours.targets, theirs.targets):
@@ -187,7 +187,6 @@ def _files(first: Record, second: Record) -> tuple[Difference, ...]:
 
 
 def _outcomes(record: Record, steps: int) -> Outcomes:
-    controlled = str(record.meta.get("controls", ""))
     return Outcomes(
         str(record.meta["run"]),
         record.status,
@@ -195,7 +194,7 @@ def _outcomes(record: Record, steps: int) -> Outcomes:
         steps,
         record.meta.get("finished"),
         main_result(record),
-        dict(results_json(record, controlled)) if controlled else {},
+        results_json(record),
     )
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -169,9 +168,11 @@ def ticks_with(record: Record, signal: str, others: Sequence[str] = ()) -> Table
     return Table({name: np.concatenate(parts.pop(name)) for name in names}, units)
 
 
-def results_json(record: Record, output: str) -> Mapping[str, Any]:
+def results_json(record: Record) -> dict[str, dict[str, float]]:
     """Return the summaries of these, as far as the run has them, for programs; those of a witness by `true_`."""
-    results: dict[str, Any] = {}
+    output, results = record.controlled, dict[str, dict[str, float]]()
+    if not output:
+        return results
     if (reached := target_results(record, output)) is not None:
         results["tracking"] = reached.summary()
     if (followed := following_result(record, output)) is not None:

@@ -100,7 +100,7 @@ class RunUncertainty:
     @classmethod
     def of(cls, record: Record, steps: Table) -> RunUncertainty:
         """Return them, from the record of a run and its readings."""
-        controlled = str(record.meta.get("controls", ""))
+        controlled = record.controlled
         signals = signal_budgets(record, steps)
         control = control_uncertainties(record, controlled) if controlled else {}
         response = record.meta.get("slots", {}).get("response", {}).get("signal", "")

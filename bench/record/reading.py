@@ -89,6 +89,11 @@ class Record:
         """Random number of the journal, which its second files have as well; empty if it has none."""
         return str(self.meta.get(IDENTITY, ""))
 
+    @property
+    def controlled(self) -> str:
+        """The signal that the run controlled; empty if there was none."""
+        return str(self.meta.get("controls", ""))
+
     def remark(self) -> str:
         """Return what is unusual: how the journal is read, and which rows are missing; else nothing."""
         missing = str(self.missing) if self.missing else ""

@@ -74,7 +74,7 @@ class TestPageOfARun:
         assert "completed after 1000 of 1000 steps" in text
         assert "confirmed the safe state" in text
         assert "Interlocks acted 1 times" in text
-        assert "Model preisach is off by at most" in text
+        assert "Errors of the model preisach: max " in text
 
     @cases(
         ("section", "words"),

@@ -101,7 +101,7 @@ def without_priors(record: Record, rows: Table) -> None:
 
     It is beyond all that the output has been.
     """
-    uncertainty, output = rows.columns.get(_UNCERTAINTY), rows.columns.get(str(record.meta.get("controls", "")))
+    uncertainty, output = rows.columns.get(_UNCERTAINTY), rows.columns.get(record.controlled)
     if uncertainty is not None and output is not None and np.isfinite(output).any():
         uncertainty[uncertainty > np.nanmax(output) - np.nanmin(output)] = np.nan
 
@@ -155,11 +155,6 @@ class RecordedRun:
         """Its metadata."""
         return self.record.meta
 
-    @property
-    def controlled(self) -> str:
-        """The signal that it controlled; empty if there was none."""
-        return str(self.meta.get("controls", ""))
-
     def signal(self, name: str) -> Signal:
         """Return a signal by its name, also one that the record does not have."""
         return next((signal for signal in self.record.signals if signal.name == name), Signal(name, "", name))
@@ -209,9 +204,23 @@ class RecordedRun:
         return models_among(self.record.files(), str(self.record.path))
 
     @cached_property
-    def control(self) -> Mapping[str, Any]:
+    def control(self) -> Mapping[str, Mapping[str, float]]:
         """The errors of what it controlled, see `results_json`; empty if it controlled nothing."""
-        return results_json(self.record, self.controlled) if self.controlled else {}
+        return results_json(self.record)
+
+    def control_lines(self) -> list[str]:
+        """Return these errors for people, a line for each kind of control."""
+        lines = []
+        for name, errors in self.control.items():
+            shown = self.signal(self.record.controlled).display
+            parts = [
+                f"{value:.1f} s a target"
+                if key == "seconds_per_target"
+                else f"error {key.replace('_', ' ')} {shown.text(value)}"
+                for key, value in errors.items()
+            ]
+            lines.append(f"{name}: {', '.join(parts)}")
+        return lines
 
     @cached_property
     def uncertainty(self) -> RunUncertainty:

@@ -77,7 +77,8 @@ def report_run(
         for line in lateness_lines(record.meta.get("lateness", {})):
             print_plain(console, line)
         figures = _draw(found, folder, figure_format)
-        _print_control(found, console)
+        for line in found.control_lines():
+            print_plain(console, line)
         print_parts([*uncertainty_parts(found.uncertainty), *errors_parts(found.applied)], console)
         result = found.result
         page = (out or record.path.parent) / PAGE_NAME
@@ -161,12 +162,3 @@ def _draw(run: RecordedRun, folder: Path, figure_format: str) -> list[Path]:
         paths.append(folder / f"errors.{figure_format}")
         draw_errors(paths[-1], {each.file.name: each for each in run.applied})
     return paths
-
-
-def _print_control(run: RecordedRun, console: Console) -> None:
-    for name, entry in run.control.items():
-        shown = run.signal(run.controlled).display
-        parts = [f"error {key} {shown.text(entry[key])}" for key in ("max", "rms", "median") if key in entry]
-        if "seconds_per_target" in entry:
-            parts.append(f"{entry['seconds_per_target']:.1f} s a target")
-        print_plain(console, f"{name}: {', '.join(parts)}")

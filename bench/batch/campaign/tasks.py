@@ -402,11 +402,9 @@ def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 def run_results(record: Record) -> dict[str, tuple[float, str]]:
     """Return what a run that controls a signal has reached: value and unit by name, such as `tracking_rms`."""
-    controlled = str(record.meta.get("controls", ""))
-    found = results_json(record, controlled) if controlled else {}
-    unit = record.unit(controlled) if controlled else "1"
+    unit = record.unit(record.controlled) if record.controlled else "1"
     return {
-        f"{kind}_{name}": (float(value), "s" if name.startswith("seconds") else unit)
-        for kind, values in found.items()
+        f"{kind}_{name}": (value, "s" if name.startswith("seconds") else unit)
+        for kind, values in results_json(record).items()
         for name, value in values.items()
     }

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from bench.analysis.applied_figures import errors_text
 from bench.analysis.figures.panels import plot_histogram
 from bench.analysis.figures.targets import plot_tracking
 from bench.analysis.report.page.model_parts import given_parts, models_parts
@@ -24,7 +25,7 @@ from bench.analysis.report.recorded_run import RecordedRun, wider
 from bench.analysis.report.run_figures import draw_loops, draw_signals
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import FollowingResult, following_result, target_results, ticks_with
-from bench.base import BenchError, Display, Floats, counted, format_duration, percent, with_unit
+from bench.base import BenchError, Display, Floats, counted, format_duration, with_unit
 from bench.protocol import LATENESS, ParameterHelp, find_protocol
 from bench.record import Event, bins_of, headline_of, interlocks_of, steps_of
 from bench.rig import SETPOINT, Interlock, RoleTable
@@ -110,31 +111,17 @@ def _lead(run: RecordedRun) -> list[str]:
         f"{f'Interlocks acted {len(acted)} times' if acted else 'No interlock acted'}; "
         f"{warned or 'no'} warning{'' if warned == 1 else 's'} and errors among {counted(len(events), 'event')}."
     )
-    for key, words in (("tracking", "brought to its targets"), ("following", "made to follow its reference")):
-        if key in run.control:
-            lead.append(f"{run.controlled} was {words} with an error of {_errors_in_words(run, run.control[key])}.")
+    lead += [f"Control of {record.controlled}, {line}." for line in run.control_lines()]
     for model in run.applied:
-        assert model.measured is not None
-        errors = model.errors()
-        display = run.signal(model.measured.name).display
-        lead.append(
-            f"Model {model.file.name} is off by at most {display.text(errors.maximum)}, RMS "
-            f"{display.text(errors.rms)} ({percent(errors.rms_percent)} of the range)."
-        )
+        lead.append(f"Errors of the model {model.file.name}: {errors_text(model.errors(), model.unit)}.")
     notes = [event.text for event in events if event.kind == "note"]
     if notes:
         lead.append(f"Last note of the protocol: {notes[-1]}")
     return lead
 
 
-def _errors_in_words(run: RecordedRun, errors: Mapping[str, float]) -> str:
-    display = run.signal(run.controlled).display
-    names = {"max": "at most", "rms": "RMS", "median": "median"}
-    return ", ".join(f"{name} {display.text(errors[key])}" for key, name in names.items() if key in errors)
-
-
 def _control(run: RecordedRun, stated: Sequence[Published], scratch: Path) -> Iterator[PagePart]:
-    record, controlled, result = run.record, run.controlled, run.control
+    record, controlled, result = run.record, run.record.controlled, run.control
     followed = _followed(run) if controlled else None
     if followed is None and "tracking" not in result:
         return
@@ -177,7 +164,7 @@ def _control(run: RecordedRun, stated: Sequence[Published], scratch: Path) -> It
 
 def _followed(run: RecordedRun) -> FollowingResult | None:
     """Return a moving reference and its output; of a protocol that marks none, whatever reference there was."""
-    record, controlled = run.record, run.controlled
+    record, controlled = run.record, run.record.controlled
     if (found := following_result(record, controlled)) is not None:
         return found
     ticks = ticks_with(record, "reference", ("t", controlled))

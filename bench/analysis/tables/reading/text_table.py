@@ -31,7 +31,7 @@ from bench.analysis.tables.reading.moments import moment_in, since_first, with_m
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.remedies import cell_remedy, is_cut_off, missing_column
 from bench.analysis.tables.reading.reshaped import StampedFile, split_stamps, turn_rows
-from bench.analysis.tables.reading.table import ReadColumns, finite_number
+from bench.analysis.tables.reading.table import ReadColumns
 from bench.analysis.tables.reading.tables import (
     Ending,
     choose_tables,
@@ -256,12 +256,18 @@ class _Body:
             return math.nan
         if place in self.moments:
             return moment_in(where, cell)
-        try:
-            return finite_number(where, cell, self._layout.decimal)
-        except DataError as error:
-            raise DataError(
-                f"{error}{cell_remedy(cell, self._layout, self._options, place, line, first=first)}"
-            ) from None
+        decimal = self._layout.decimal
+        if not cell:
+            wrong = "is empty; expected a number"
+        elif not is_number(cell, decimal):
+            wrong = f"{cell if len(cell) < 40 else f'{cell[:40]}…'!r} is not a number"
+        else:
+            value = float((cell.replace(",", ".") if decimal == "," else cell).upper().replace("D", "E"))
+            if math.isfinite(value):
+                return value
+            wrong = f"{cell[:40]} is not a finite number"
+        remedy = cell_remedy(cell, self._layout, self._options, place, line, first=first)
+        raise DataError(f"{where}: {wrong}{remedy}")
 
     def _end(self) -> int | None:
         return None if self.ending is None else self.ending.end
