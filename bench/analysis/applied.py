@@ -26,6 +26,7 @@ from bench.identification import (
     load_model,
     measure_errors,
     parse_model,
+    recalibrate,
 )
 from bench.models import Operator, TimedModel
 from bench.record import Record, Table
@@ -226,8 +227,14 @@ def apply_model(
     if session is not None:
         if data.output is None:
             raise ConfigurationError("--recalibrate needs measured outputs: name their column with --output")
-        found = session.estimate(bound, inputs, data.outputs, skip=skip, state=state)
-        first = session.first_unused(inputs.size, skip)
+        kinds, rows = session.kinds, session.rows
+        try:
+            found = recalibrate(bound, inputs, data.outputs, kinds, rows=rows, skip=skip, state=state)
+        except ValueError as error:
+            raise ConfigurationError(f"--recalibrate {','.join(kinds)}: {error}") from None
+        if rows is not None and rows < inputs.size:
+            # The rows that tell the recalibration do not count.
+            first = max(rows, skip)
     with np.errstate(over="ignore", invalid="ignore"):
         predicted = bound.evaluate(inputs, state) if found is None else found.predict(bound, inputs, state)
     return Applied.to(data, model, np.asarray(predicted), first, state, found)

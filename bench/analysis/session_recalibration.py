@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from bench.base import ConfigurationError, Floats
-from bench.identification import Kind, Recalibration, parse_kinds, recalibrate
-from bench.models import Operator, TimedSequence
+from bench.base import ConfigurationError
+from bench.identification import Kind, Recalibration, parse_kinds
 
 
 @dataclass(frozen=True)
@@ -40,28 +38,6 @@ class Session:
             return cls(parse_kinds(text), rows)
         except ValueError as error:
             raise ConfigurationError(f"--{error}") from None
-
-    def estimate(
-        self,
-        operator: Operator[Any] | TimedSequence,
-        inputs: Floats,
-        outputs: Floats,
-        *,
-        skip: int = 0,
-        state: Any = None,  # noqa: ANN401 - each operator has its own
-    ) -> Recalibration:
-        """Return the recalibration of a model by measured outputs; arguments as `recalibrate`.
-
-        Raises ConfigurationError if the rows do not allow it.
-        """
-        try:
-            return recalibrate(operator, inputs, outputs, self.kinds, rows=self.rows, skip=skip, state=state)
-        except ValueError as error:
-            raise ConfigurationError(f"--recalibrate {','.join(self.kinds)}: {error}") from None
-
-    def first_unused(self, size: int, skip: int = 0) -> int:
-        """Return the first row that is not used for the estimate, of `size`; `skip` if all are."""
-        return skip if self.rows is None or self.rows >= size else max(self.rows, skip)
 
 
 def session_rows(found: Recalibration, size: int, units: tuple[str, str]) -> Sequence[tuple[str, str]]:

@@ -129,16 +129,6 @@ def _control(run: RecordedRun, stated: Sequence[Published], scratch: Path) -> It
     factor, shown = display.factor, display.unit
     controller = str(run.meta["parameters"].get("controller", "output"))
     plot = partial(plot_tracking, output_label=with_unit(controlled, shown), error_label=with_unit("error", shown))
-    rows = []
-    for key in ("tracking", "following"):
-        for name, value in result.get(key, {}).items():
-            if name == "seconds_per_target":
-                rows.append((key, "time a target", f"{value:.1f}", "s"))
-            else:
-                number, _, unit = display.text(value).partition(" ")
-                rows.append((key, f"error {name}", number, unit))
-    if rows:
-        yield PageTable(("", "figure", "value", "unit"), rows, numbers_from=2)
     if (reached := target_results(record, controlled)) is not None:
         path = scratch / "targets.svg"
         largest = next((float(each.value) / each.scale for each in stated if each.path == ("tracking", "max")), None)
