@@ -238,8 +238,8 @@ class ResultTable:
         table = Table(title=self.title.format_map(values), title_justify="left", box=None)
         for i, column in enumerate(self.columns):
             table.add_column(column, justify="left" if i == 0 else "right", no_wrap=i == 0)
-        for row in self.rows:
-            table.add_row(*(cell.format_map(values) for cell in row))
+        for cells in self._cells(values):
+            table.add_row(*cells)
         show_table(console, table)
         if self.note:
             console.print(self.note.format_map(values))
@@ -247,10 +247,12 @@ class ResultTable:
     def markdown(self, values: Mapping[str, Any]) -> str:
         """Return it as a table of a Markdown text, the title in bold above and the note below."""
         title = self.title.format_map(values)
-        rows = [self.columns, ["---"] * len(self.columns)]
-        rows += [[cell.format_map(values) for cell in row] for row in self.rows]
+        rows = [self.columns, ["---"] * len(self.columns), *self._cells(values)]
         table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
         return "\n\n".join(filter(None, (f"**{title[:1].upper()}{title[1:]}**", table, self.note.format_map(values))))
+
+    def _cells(self, values: Mapping[str, Any]) -> list[list[str]]:
+        return [[cell.format_map(values) for cell in row] for row in self.rows]
 
 
 @dataclass(frozen=True)

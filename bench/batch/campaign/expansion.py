@@ -131,19 +131,19 @@ class _Expander:
     def expansion(self) -> Expansion:
         """Return all tasks, those of runs in an order in which their models come before them."""
         file = self._file
-        for number, models in enumerate(file.tables.models):
-            self._check_models(number, models)
+        for where, models in file.each("models"):
+            self._check_models(where, models)
         # A table of models comes after its runs, and before those that use it.
-        waiting = list(file.tables.models)
-        for number, table in enumerate(file.tables.runs):
-            self._add_runs(file.where("runs", number), table)
-            for models in [each for each in waiting if self._runs.keys() >= set(each.runs)]:
-                self._add_models(file.where("models", file.tables.models.index(models)), models)
+        waiting = list(file.each("models"))
+        for where, table in file.each("runs"):
+            self._add_runs(where, table)
+            for models in [each for each in waiting if self._runs.keys() >= set(each[1].runs)]:
+                self._add_models(*models)
                 waiting.remove(models)
-        for number, comparisons in enumerate(file.tables.comparisons):
-            self._add_comparisons(file.where("comparisons", number), comparisons)
-        for number, study in enumerate(file.tables.studies):
-            self._add_studies(file.where("studies", number), study)
+        for where, comparisons in file.each("comparisons"):
+            self._add_comparisons(where, comparisons)
+        for where, study in file.each("studies"):
+            self._add_studies(where, study)
         if len(self._tasks) > 2 * file.tables.most_runs:
             raise ConfigurationError(
                 f"{file.path}: {len(self._tasks)} runs, models and studies; expected at most twice most_runs = "
@@ -151,9 +151,8 @@ class _Expander:
             )
         return Expansion(self._tasks, self._varying, self._plans, tuple(self._kernels))
 
-    def _check_models(self, number: int, table: ModelsTable) -> None:
-        where = self._file.where("models", number)
-        known = {runs.label: runs for runs in self._file.tables.runs}
+    def _check_models(self, where: str, table: ModelsTable) -> None:
+        known = {runs.name: runs for runs in self._file.tables.runs}
         for name in table.runs:
             _check_known(f"{where}: runs", name, known, "table of runs of this name")
             seeds = known[name].seeds
@@ -201,8 +200,8 @@ class _Expander:
                 f"most_runs = {most} are allowed"
             )
         of_models = {key for key, values in parameters.items() if self._has_several_models(where, key, values)}
-        self._varying[table.label] = {key: "" for key, length in lengths.items() if length > 1 or key in of_models}
-        self._runs[table.label] = []
+        self._varying[table.name] = {key: "" for key, length in lengths.items() if length > 1 or key in of_models}
+        self._runs[table.name] = []
         for protocol, rig in itertools.product(table.protocol, table.rigs):
             for replaced, chosen in itertools.product(_grid(overrides), _grid(parameters)):
                 self._add_point(where, table, protocol, rig, replaced, chosen)
@@ -243,7 +242,7 @@ class _Expander:
             else:
                 check_before_moving(known.description, definition, planned)
         inputs = {key: path for key, path in definition.files(parameters).items() if key not in referred}
-        varying, units = self._varying[table.label], definition.units(file.roles)
+        varying, units = self._varying[table.name], definition.units(file.roles)
         varying |= {key: unit or units.get(key, "") for key, unit in varying.items() if key in chosen}
         determining = {
             "code": code_digest(),
@@ -261,7 +260,7 @@ class _Expander:
                     self._check_faults(known, Path(path))
             for models in self._sources(where, referred, self._beside(rig), seed):
                 task = RunTask(
-                    table=table.label,
+                    table=table.name,
                     protocol=self._beside(protocol),
                     rig=self._beside(rig),
                     seed=seed,
@@ -281,8 +280,8 @@ class _Expander:
                     "faults": self._digest(Path(path)) if path else "",
                     "models": {key: model.identity for key, model in models.items()},
                 }
-                task = self._added(task, table.label, "-".join(parts), {**determining, **own_determining})
-                self._runs[table.label].append(_Run(task, known, definition))
+                task = self._added(task, table.name, "-".join(parts), {**determining, **own_determining})
+                self._runs[table.name].append(_Run(task, known, definition))
                 if planned is not None and planned.complete:
                     self._plans[task.name] = (planned.seconds, planned.seconds * known.pace)
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -88,12 +88,7 @@ class RunsTable(CheckedTable):
     def _has_name(self) -> Self:
         if not self.name and (len(self.protocol) > 1 or ".py" in self.protocol[0]):
             raise ValueError("name is missing; a table with several protocols, or one from a file, needs one")
-        return self
-
-    @property
-    def label(self) -> str:
-        """How it is named: by its own name, or that of its protocol."""
-        return self.name or self.protocol[0]
+        return self if self.name else self.model_copy(update={"name": self.protocol[0]})
 
 
 class ModelsTable(CheckedTable):
@@ -163,13 +158,10 @@ class CampaignFile:
     path: Path  # where it was read from
     tables: CampaignTables
 
-    def where(self, kind: str, number: int) -> str:
-        """Return the place of a table for messages, such as `night.toml: runs.0 (characterize)`."""
-        return f"{self.path}: {kind}.{number} ({self.names(kind)[number]})"
-
-    def names(self, kind: str) -> list[str]:
-        """Return the names of the tables of a kind, in their order."""
-        return [each.label if isinstance(each, RunsTable) else each.name for each in getattr(self.tables, kind)]
+    def each(self, kind: str) -> Iterator[tuple[str, Any]]:
+        """Yield the tables of a kind with their places for messages, such as `night.toml: runs.0 (characterize)`."""
+        for number, table in enumerate(getattr(self.tables, kind)):
+            yield f"{self.path}: {kind}.{number} ({table.name})", table
 
     def beside(self, name: str) -> str:
         """Return a path of the file, which is relative to its folder; anything else as it is."""
@@ -195,12 +187,13 @@ def read_campaign(path: Path) -> CampaignFile:
     if not tables.runs and not tables.studies:
         raise ConfigurationError(f"{path}: asks for nothing; expected tables [[runs]] or [[studies]]")
     for kind in ("runs", "models", "comparisons", "studies"):
-        names = file.names(kind)
-        for i, name in enumerate(names):
-            if name in names[:i]:
+        names = set[str]()
+        for where, table in file.each(kind):
+            if table.name in names:
                 raise ConfigurationError(
-                    f"{file.where(kind, i)}: name = {name!r}: an earlier table has this name; give it another"
+                    f"{where}: name = {table.name!r}: an earlier table has this name; give it another"
                 )
+            names.add(table.name)
     return file
 
 

@@ -89,7 +89,6 @@ class CampaignTask(ABC):
     kind: ClassVar[str]
     leaves: ClassVar[str] = ""
     """The file in its folder that its results are in, for people and for other tasks; none if empty."""
-    _not_described: ClassVar[tuple[str, ...]] = ()
 
     name: str = ""
     identity: str = ""
@@ -160,8 +159,8 @@ class CampaignTask(ABC):
 
     def describe(self) -> dict[str, Any]:
         """Return what it is, for programs."""
-        left_out = {"name", "identity", *self._not_described}
-        return {"kind": self.kind, **{key: value for key, value in asdict(self).items() if key not in left_out}}
+        own = {key: value for key, value in asdict(self).items() if key not in ("name", "identity")}
+        return {"kind": self.kind, **own}
 
     @abstractmethod
     def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
@@ -282,7 +281,6 @@ class ModelTask(CampaignTask):
 
     kind = "model"
     leaves = MODEL_NAME
-    _not_described = ("input", "output", "label")
 
     table: str  # name of the table that asks for it
     sources: tuple[str, ...]  # names of the tasks of the runs; several for a model that needs them
