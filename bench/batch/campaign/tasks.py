@@ -6,9 +6,9 @@ import math
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias
 
 from bench.analysis import (
     FEWEST_ROWS,
@@ -108,9 +108,19 @@ class CampaignTask(ABC):
         """The files that it reads, with the suffixes of those beside each that it may read as well."""
         return {}
 
-    def moved(self, places: Mapping[str, str]) -> CampaignTask:  # noqa: ARG002 - of a task without files
+    def moved(self, places: Mapping[str, str]) -> Self:
         """Return the same task with its files in other places, by their old path."""
-        return self
+
+        def place(value: Any) -> Any:  # noqa: ANN401 - a field of any task
+            if isinstance(value, Mapping):
+                return {key: place(each) for key, each in value.items()}
+            if not isinstance(value, str):
+                return value
+            # A protocol of a file may have its name behind the path.
+            file, suffix, name = value.partition(".py")
+            return places.get(value, places.get(file + suffix, file + suffix) + name)
+
+        return replace(self, **{each.name: place(getattr(self, each.name)) for each in fields(self)})
 
     def carry_out(self, campaign: Path) -> Done:
         """Carry it out in the folder of a campaign, and leave its folder there, whole or not at all.
@@ -205,20 +215,6 @@ class RunTask(CampaignTask):
         if ".py" in self.protocol:
             found[program_of(self.protocol)] = PROGRAMS
         return found
-
-    def moved(self, places: Mapping[str, str]) -> CampaignTask:
-        """Return the same run with its files in other places."""
-        file, suffix, name = self.protocol.partition(".py")
-        return replace(
-            self,
-            protocol=places.get(file + suffix, file + suffix) + name,
-            rig=places.get(self.rig, self.rig),
-            faults=places.get(self.faults, self.faults),
-            parameters={
-                key: places.get(value, value) if isinstance(value, str) else value
-                for key, value in self.parameters.items()
-            },
-        )
 
     @property
     def base(self) -> str:
