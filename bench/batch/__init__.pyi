@@ -18,10 +18,6 @@ from .campaign.file import (
 from .campaign.results import (
     show_results as show_results,
 )
-from .campaign.tasks import (
-    CampaignTask as CampaignTask,
-    Done as Done,
-)
 from .study import (
     ResultTable as ResultTable,
     RunSeries as RunSeries,

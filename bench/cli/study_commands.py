@@ -136,20 +136,18 @@ def campaign(
         from bench.batch import check_address
 
         check_address(scheduler)
-    before = done_before(expansion.tasks, folder)
-    cores = 1 if scheduler else workers or available_cores()
-    console.print(expansion.announcement(before.done, cores))
-    if dry_run:
-        for line in expansion.listing(before.done):
-            print_plain(console, line)
-        write_json(json_file, {name: task.describe() for name, task in expansion.tasks.items()})
-        return
     with ExitStack() as stack:
-        stack.enter_context(_saying_how_to_go_on(folder))
-        stack.enter_context(opened_folder(folder))
-        write_result(folder / "campaign.toml", file.read_text(encoding="utf-8-sig"))
-        # Another process may have been at work here until it was locked.
+        if not dry_run:
+            stack.enter_context(_saying_how_to_go_on(folder))
+            stack.enter_context(opened_folder(folder))
         before = done_before(expansion.tasks, folder)
+        console.print(expansion.announcement(before.done, 1 if scheduler else workers or available_cores()))
+        if dry_run:
+            for line in expansion.listing(before.done):
+                print_plain(console, line)
+            write_json(json_file, {name: task.describe() for name, task in expansion.tasks.items()})
+            return
+        write_result(folder / "campaign.toml", file.read_text(encoding="utf-8-sig"))
         for line in before.put_in_place(folder):
             print_plain(console, line)
         executor: Executor

@@ -390,6 +390,15 @@ def test_a_study_runs_with_several_seeds(campaign, tmp_path, monkeypatch, capsys
     assert "**A no**\n\n| seed | steps |\n| --- | --- |\n| 2.0 (1.0–6.0) | 2 |" in written
 
 
+def test_a_study_takes_the_file_of_its_rig_along(campaign, tmp_path, monkeypatch):
+    study = Study("vo2", "", "", the_study)
+    monkeypatch.setattr(registry, "load", lambda *_: study)
+    (task,) = expand(read_campaign(campaign("[[studies]]\nname = 'climbs'\nrigs = 'heater.toml'\n"))).tasks.values()
+    rig = tmp_path / "heater.toml"
+    assert list(task.files) == [rig]
+    assert task.moved({str(rig): "/elsewhere/heater.toml"}).rig == "/elsewhere/heater.toml"
+
+
 def test_a_killed_worker_is_replaced_and_its_run_equals_one_alone(campaign, tmp_path):
     path = campaign(STAIRS, ("increment = [5.0, 10.0]", "increment = 0.0\ncount = 800"))
     expansion = expand(read_campaign(path))

@@ -356,6 +356,11 @@ class StudyTask(CampaignTask):
     rig: str  # another rig than the study's own; empty for that
     seed: int  # from which the seeds of its runs come
 
+    @property
+    def files(self) -> Mapping[Path, Sequence[str]]:
+        """The rig file."""
+        return {Path(self.rig): PROGRAMS_AND_RIGS} if self.rig.endswith(".toml") else {}
+
     def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
         del campaign
         study: Study = registry.load("studies", self.study)
