@@ -110,7 +110,7 @@ def plot_signals(
                 *outline(curve.horizontal, curve.vertical), color=MEASURED, linewidth=0.7, marker="." if few else "",
                 markersize=3.0,
             )  # fmt: skip
-            axes.set_ylabel(curve.label, rotation=0, ha="right", va="center", fontsize=8)
+            axes.set_ylabel(curve.label.replace(" / ", "\n/ "), rotation=0, ha="right", va="center", fontsize=8)
         legend_above(panels[0])
         panels[-1].set_xlabel(horizontal_label)
 

@@ -39,7 +39,7 @@ def draw_signals(path: Path, run: RecordedRun) -> str:
             constant.append(f"{signal.name} {shown.number(float(known[0]))} {shown.unit}".rstrip())
             continue
         has_ticks |= not is_read
-        curves.append(Curve(_label(signal), scale * times, shown.factor * values))
+        curves.append(Curve(with_unit(signal.name, shown.unit), scale * times, shown.factor * values))
     if not curves:
         return ""
     plot_signals(path, curves, label, [(phase.name, scale * phase.start, scale * phase.end) for phase in run.phases])
@@ -115,10 +115,6 @@ def _is_left_alone(run: RecordedRun) -> bool:
     """Return whether a run of several steps has set-points that never change; one that was imported has none."""
     names = [signal.name for signal in run.record.signals if signal.name.endswith(SETPOINT)]
     return len(run.steps) > 1 and bool(names) and all(np.unique(run.steps[name]).size == 1 for name in names)
-
-
-def _label(signal: Signal) -> str:
-    return with_unit(signal.name, signal.display.unit).replace(" / ", "\n/ ")
 
 
 def _range(*times: Floats) -> tuple[float, float]:

@@ -50,7 +50,7 @@ def _loops(runs: Sequence[RecordedRun], scratch: Path) -> Iterator[PageFigure]:
             horizontal, vertical = first.labels
             plot_panels(path, curves, horizontal_label=horizontal, vertical_label=vertical, measured=[*curves])
             caption = f"{ends[1]} over {ends[0]} in both runs, on the same axes."
-            yield PageFigure(inlined(path, caption), caption)
+            yield inlined(path, caption)
 
 
 def _differences(found: RunComparison, tables: Sequence[Table], scratch: Path) -> list[PageFigure]:
@@ -61,10 +61,10 @@ def _differences(found: RunComparison, tables: Sequence[Table], scratch: Path) -
         factor, unit = fitting_prefix(apart.unit, apart.maximum)
         apart_now = factor * (tables[1][name][theirs] - tables[0][name][ours])
         if np.any(np.nan_to_num(apart_now)):
-            curves.append(Curve(with_unit(name, unit).replace(" / ", "\n/ "), common, apart_now))
+            curves.append(Curve(with_unit(name, unit), common, apart_now))
     if not curves or common.size < 2:
         return []
     path = scratch / "differences.svg"
     plot_signals(path, curves, "step")
     caption = "Second less first, over the steps that both have."
-    return [PageFigure(inlined(path, caption), caption)]
+    return [inlined(path, caption)]

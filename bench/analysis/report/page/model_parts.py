@@ -36,24 +36,22 @@ def models_parts(models: Sequence[Applied], times: Floats, scratch: Path) -> lis
 
 def given_parts(files: Mapping[str, ModelFile], scratch: Path) -> list[PagePart]:
     """Return the models that a run was given, by the parameter that names each, with their densities."""
-    rows = []
-    figures = []
+    rows, figures = [], list[PageFigure]()
     for i, (parameter, file) in enumerate(files.items()):
         source = file.provenance.get("source") or ", ".join(file.provenance.get("sources", ()))
         band = "none" if file.band is None else f"{100.0 * file.band.level:g} %"
         known = "" if file.validity is None else file.validity.text(file.response.input_unit)
         rows.append((parameter, file.name, file.model.kind, str(source), known, band))
-        for k, density in enumerate(file.model.densities()):
-            caption = f"Density of {file.name} {density.title}".rstrip()
-            plot_densities(path := scratch / f"given-{i}-{k}.svg", [density])
-            figures.append(_map(path, caption, ", as the run was given it"))
+        figures += _densities(file, scratch, f"given-{i}", ", as the run was given it")
     heads = ("parameter", "model", "kind", "identified from", "valid for inputs", "prediction band")
     return [PageTable(heads, rows), *figures] if rows else []
 
 
-def _map(path: Path, caption: str, more: str = "") -> PageFigure:
-    """Return a figure whose colours are values."""
-    return PageFigure(inlined(path, caption), f"{caption}{more}.", is_map=True)
+def _densities(file: ModelFile, scratch: Path, name: str, more: str = "") -> Iterator[PageFigure]:
+    """Draw the densities of a model, under a name; their colours are values."""
+    for i, density in enumerate(file.model.densities()):
+        plot_densities(path := scratch / f"{name}-{i}.svg", [density])
+        yield inlined(path, f"{f'Density of {file.name} {density.title}'.rstrip()}{more}.", is_map=True)
 
 
 def errors_parts(models: Sequence[Applied]) -> list[PageTable | PageText]:
@@ -101,7 +99,7 @@ def _fits(models: Sequence[Applied], times: Floats, scratch: Path, number: int) 
             f"{first.measured.title} over {over}: measured (points) and {', '.join(by_name)} (lines); below, what "
             f"each leaves, on one scale.{shaded}"
         )
-        yield PageFigure(inlined(path, caption), caption)
+        yield inlined(path, caption)
 
 
 def _bands(model: Applied) -> Iterator[PageTable | PageText]:
@@ -127,20 +125,17 @@ def _details(model: Applied, scratch: Path, number: int) -> Iterator[PagePart]:
             caption += f"; {coverage.summary()} by this run"
         if sigma is not None:
             caption += "; beside it its standard uncertainty"
-        yield _map(path, caption)
+        yield inlined(path, f"{caption}.", is_map=True)
         if coverage is not None and isinstance(memory := model.file.memory, MemoryCurve):
             path = scratch / f"coverage-{number}-{i}.svg"
             plot_coverage(path, density, coverage.swept, memory)
-            yield _map(
-                path, f"What this run swept of the plane of {name}, and the memory at the end of the model's data"
-            )
+            caption = f"What this run swept of the plane of {name}, and the memory at the end of the model's data."
+            yield inlined(path, caption, is_map=True)
     yield _coefficients(model, found, cells)
 
 
 def _details_in_time(model: Applied, scratch: Path, number: int) -> Iterator[PageFigure | PageTable]:
-    for i, density in enumerate(model.file.model.densities()):
-        plot_densities(path := scratch / f"density-{number}-{i}.svg", [density])
-        yield _map(path, f"Density of {model.file.name}")
+    yield from _densities(model.file, scratch, f"density-{number}")
     rows = [(name, f"{value:.6g}", unit) for name, (value, unit) in model.file.model.parameters().items()]
     heads = ("parameter", "value", "unit")
     yield PageTable(heads, rows, title=f"parameters of {model.file.name}", numbers_from=1)

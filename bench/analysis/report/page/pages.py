@@ -39,7 +39,7 @@ class PageTable:
 class PageFigure:
     """A figure."""
 
-    svg: str  # an `svg` element, as `bench.analysis.report.page.svg.inlined` returns it
+    svg: str  # an `svg` element
     caption: str  # what it shows
     is_map: bool = False  # whether its colours are values, which a dark page leaves as they are
     kind = "figure"
@@ -97,13 +97,13 @@ _FEW_MARKS = 20
 """Marks that stay as they are, such as those of an axis."""
 
 
-def inlined(path: Path, description: str) -> str:
-    """Return the content of an SVG file that matplotlib drew, as an element of a page.
+def inlined(path: Path, caption: str, *, is_map: bool = False) -> PageFigure:
+    """Return an SVG file that matplotlib drew as a figure of a page.
 
     Coordinates keep a hundredth of a point, and the dots of a curve become one path. The identifiers that stay are
     those of clips and marks, which differ from figure to figure.
 
-    `description` is a plain text for readers who do not see the figure.
+    The caption is for readers who do not see the figure as well.
 
     Raises DataError if it cannot be read or is no such file.
     """
@@ -119,7 +119,8 @@ def inlined(path: Path, description: str) -> str:
     radii = {each["mark"]: float(each["radius"]) for each in _DOTS.finditer(text)}
     text = _MARKS.sub(lambda marks: _one_path(marks[0], radii), _PATHS.sub(_short_path, text))
     text = re.sub(r">\s+<", "><", text)
-    return text.replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1)
+    text = text.replace("<svg ", f'<svg role="img" aria-label="{escape(caption)}" ', 1)
+    return PageFigure(text, caption, is_map)
 
 
 def _short_path(path: re.Match[str]) -> str:

@@ -19,7 +19,7 @@ from bench.analysis.applied_figures import errors_text
 from bench.analysis.figures.panels import plot_histogram
 from bench.analysis.figures.targets import plot_tracking
 from bench.analysis.report.page.model_parts import given_parts, models_parts
-from bench.analysis.report.page.pages import Page, PageFigure, PagePart, PageSection, PageTable, PageText, inlined
+from bench.analysis.report.page.pages import Page, PagePart, PageSection, PageTable, PageText, inlined
 from bench.analysis.report.published import Published
 from bench.analysis.report.recorded_run import RecordedRun, wider
 from bench.analysis.report.run_figures import draw_loops, draw_signals
@@ -54,7 +54,7 @@ def run_page(run: RecordedRun, published: Sequence[Published] = ()) -> Page:
             **(
                 {"Loops and models": models_parts(models, times, scratch)}
                 if models
-                else {"Loops": [_figure(path, caption) for path, caption in draw_loops(scratch, "svg", run)]}
+                else {"Loops": [inlined(path, caption) for path, caption in draw_loops(scratch, "svg", run)]}
             ),
             "Numbers of the paper": _published(stated, run.result),
             "Models that the run was given": given_parts(run.given, scratch),
@@ -76,10 +76,6 @@ def run_page(run: RecordedRun, published: Sequence[Published] = ()) -> Page:
         lead=_lead(run),
         sections=[PageSection(title, parts) for title, parts in sections.items() if parts],
     )
-
-
-def _figure(path: Path, caption: str) -> PageFigure:
-    return PageFigure(inlined(path, caption), caption)
 
 
 def _lead(run: RecordedRun) -> list[str]:
@@ -138,7 +134,7 @@ def _control(run: RecordedRun, stated: Sequence[Published], scratch: Path) -> It
             {controller: factor * reached.outputs},
             published=None if largest is None else {controller: factor * largest},
         )
-        yield _figure(path, f"Targets (marks) and what was reached (points) under {controller}; below, the errors.")
+        yield inlined(path, f"Targets (marks) and what was reached (points) under {controller}; below, the errors.")
         yield _targets_table(reached.targets, reached.outputs, reached.seconds, display)
     if followed is not None and "tracking" not in result:
         path = scratch / "following.svg"
@@ -149,7 +145,7 @@ def _control(run: RecordedRun, stated: Sequence[Published], scratch: Path) -> It
             horizontal=followed.times,
             horizontal_label="time / s",
         )
-        yield _figure(path, f"Reference (grey) and output under {controller}; below, the error.")
+        yield inlined(path, f"Reference (grey) and output under {controller}; below, the error.")
 
 
 def _followed(run: RecordedRun) -> FollowingResult | None:
@@ -187,7 +183,7 @@ def _signals(run: RecordedRun, scratch: Path) -> Iterator[PagePart]:
     yield signals_table(run)
     path = scratch / "signals.svg"
     if caption := draw_signals(path, run):
-        yield _figure(path, caption)
+        yield inlined(path, caption)
 
 
 def _lateness(run: RecordedRun, scratch: Path) -> Iterator[PagePart]:
@@ -201,7 +197,7 @@ def _lateness(run: RecordedRun, scratch: Path) -> Iterator[PagePart]:
         plot_histogram(path, 1e3 * late, label="lateness / ms")
         shares = np.percentile(late, [50, 95, 99, 100]) * 1e3
         names = ("median", "95 %", "99 %", "greatest")
-        yield _figure(path, f"How late the {late.size} recorded samples of loops at a fixed rate were.")
+        yield inlined(path, f"How late the {late.size} recorded samples of loops at a fixed rate were.")
         rows = [(name, f"{value:.3f}") for name, value in zip(names, shares.tolist(), strict=True)]
         yield PageTable(("lateness", "ms"), rows, numbers_from=1)
 
