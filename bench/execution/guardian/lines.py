@@ -142,8 +142,8 @@ class LineThreads:
 
     def _serve(self, call: _Call, away: list[str]) -> None:
         """Carry a call out, or let it wait for its device."""
-        device = call.device
-        self.late[device] = max(self.late[device], self._clock.now() - call.since)
+        device, now = call.device, self._clock.now()
+        self.late[device] = max(self.late[device], now - call.since)
         try:
             if call.priority != SAFE:
                 if self._ending.is_set():
@@ -159,18 +159,18 @@ class LineThreads:
             if call.priority == SAFE or self._ending.is_set() or device in self._lost:
                 result = Result(device, None, lost, was_away=False)
             else:
-                self._miss(call, lost, away)
+                self._miss(call, lost, now, away)
                 return
         # An error of a driver, of whatever kind, is the answer to its call; the thread goes on.
         except BaseException as error:
             result = Result(device, None, error, was_away=False)
         _answer(call, result)
 
-    def _miss(self, call: _Call, lost: DeviceConnectionError, away: list[str]) -> None:
-        """Look for the device of a call that has failed."""
+    def _miss(self, call: _Call, lost: DeviceConnectionError, since: float, away: list[str]) -> None:
+        """Look for the device of a call that has failed, and began then."""
         device = call.device
         try:
-            absence = Absence(self._devices[device], lost, self._clock, self._longest(device))
+            absence = Absence(self._devices[device], lost, self._clock, self._longest(device), since)
         except BaseException as error:
             self._give_up(device, [call], error)
         else:

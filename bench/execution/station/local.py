@@ -221,7 +221,7 @@ class LocalStation(Station):
         try:
             return call()
         except DeviceConnectionError as error:
-            self._reconnect(name, error)
+            self._reconnect(name, error, began)
             return call()
         finally:
             now = self.clock.now()
@@ -242,9 +242,9 @@ class LocalStation(Station):
         error.args = (f"{error.device}: {error.text}",)
         raise error
 
-    def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
+    def _reconnect(self, name: str, error: DeviceConnectionError, since: float) -> None:
         self._away.add(name)
-        absence = Absence(self._rig.devices[name], error, self.clock, self._longest_away[name])
+        absence = Absence(self._rig.devices[name], error, self.clock, self._longest_away[name], since)
         # Those that share its line have waited for it.
         self._look_at_others()
         while (seconds := absence.try_again()) is None:

@@ -26,6 +26,8 @@ class Absence:
         The clock of the run.
     longest : LongestAbsence
         How long it may be away; see `longest_away`.
+    since : float
+        Instant at which that request began, s: its watchdog has been waiting from then on.
 
     Attributes
     ----------
@@ -40,14 +42,16 @@ class Absence:
         What it failed with, if its driver cannot open its line again.
     """
 
-    def __init__(self, device: Device, lost: DeviceConnectionError, clock: Clock, longest: LongestAbsence) -> None:
+    def __init__(
+        self, device: Device, lost: DeviceConnectionError, clock: Clock, longest: LongestAbsence, since: float
+    ) -> None:
         if type(device).reconnect is Device.reconnect:
             raise lost
         self.lost = lost
         self._device = device
         self._clock = clock
         self._longest = longest
-        self._since = self.due = clock.now()
+        self._since, self.due = since, clock.now()
 
     def try_again(self) -> float | None:
         """Try once to reach it; return how long it was away, s, or None if it still is.

@@ -160,6 +160,20 @@ def test_a_line_that_stays_away_is_given_up():
     assert bench.news == []
 
 
+def test_a_line_is_away_from_when_the_request_began_that_waited_for_it_in_vain():
+    clock = VirtualClock()
+    device = Instrument("a", attempts=1000)
+    bench = Bench({"a": "line"}, longest=3.0, devices={"a": device}, clock=clock)
+
+    def wait_in_vain():
+        clock.sleep(2.0)
+        return device.measure()
+
+    bench.submit(BENCH, "a", wait_in_vain)
+    assert "was not back within 3 s" in str(bench.result().error)
+    assert clock.now() == pytest.approx(3.0, abs=0.3)
+
+
 def test_the_devices_of_a_lost_line_are_waited_for_at_the_same_time():
     clock = VirtualClock()
     devices = {name: Instrument(name, attempts=1000) for name in ("a", "b")} | {"c": Instrument("c")}
