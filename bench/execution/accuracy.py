@@ -57,9 +57,10 @@ def check_accuracy(
     if not worst.stated:
         raise ConfigurationError(f"{option}: cannot be promised. {worst.advice()}")
     if worst.expanded > wanted:
+        shown = worst.in_fitting_unit()
         raise ConfigurationError(
-            f"{option}: the budget of {signal} supports {worst.expanded:.2g} {unit} ({100.0 * LEVEL:.0f} %) at "
-            f"{worst.value:.4g} {unit}. {worst.advice()}"
+            f"{option}: the budget of {signal} supports {shown.expanded:.2g} {shown.unit} ({100.0 * LEVEL:.0f} %) at "
+            f"{shown.value:.4g} {shown.unit}. {shown.advice()}"
         )
     return {"signal": signal, "unit": unit, "asked": wanted, "supported": worst.expanded, "level": LEVEL}
 

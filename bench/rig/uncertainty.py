@@ -35,7 +35,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from bench.base import CheckedTable, ConfigurationError, DeferredModule, DeviceError, difference_unit, read_quantity
+from bench.base import (
+    CheckedTable,
+    ConfigurationError,
+    DeferredModule,
+    DeviceError,
+    difference_unit,
+    fitting_prefix,
+    read_quantity,
+)
 from bench.rig.calibration import Calibrated, Calibration
 from bench.rig.derived import DerivedSignal
 from bench.rig.layout import Range
@@ -254,6 +262,15 @@ class Budget:
             f"Most would be gained at {first.label} ({100.0 * self.share(first):.0f} % of the variance; {how}): "
             f"without it U would be {left:.2g} instead of {self.expanded:.2g} {self.unit}."
         )
+
+    def in_fitting_unit(self) -> Budget:
+        """Return the same budget in the unit that fits its value, such as mm in place of m, for people to read."""
+        factor, unit = fitting_prefix(self.unit, self.value, self.expanded, least=0.1)
+        rows = (replace(row, contribution=factor * row.contribution) for row in self.rows)
+        alike = (
+            replace(row, standard=factor * row.standard, unit=unit) if row.unit == self.unit else row for row in rows
+        )
+        return replace(self, value=factor * self.value, unit=unit, rows=tuple(alike))
 
     def to_json(self) -> dict[str, Any]:
         """Return the budget for programs; numbers that are infinite become null."""

@@ -6,10 +6,8 @@ from collections.abc import Mapping
 
 from bench.analysis.report.page.pages import PageTable, PageText
 from bench.analysis.uncertain_results import ControlUncertainty, RunUncertainty, rounded, two_digits
-from bench.base import fitting_prefix
+from bench.base import fitting_prefix, with_unit
 from bench.rig import Budget
-
-BUDGET_HEADS = ("component", "type", "u", "sensitivity", "ν", "part", "%")
 
 _MANY = 1000.0
 """Degrees of freedom that count as infinite. Derivation: Student's t then differs from the normal one by 0.1 %."""
@@ -20,8 +18,9 @@ def uncertainty_parts(found: RunUncertainty) -> list[PageTable | PageText]:
     parts: list[PageTable | PageText] = []
     for name, each in found.control.items():
         parts += [PageText(f"{name}: {line}") for line in _control_lines(each)]
-    if (budget := found.shown) is not None:
-        parts.append(PageTable(BUDGET_HEADS, budget_rows(budget), title=budget_title(budget)))
+    if found.shown is not None:
+        budget = found.shown.in_fitting_unit()
+        parts.append(PageTable(budget_heads(budget), budget_rows(budget), title=budget_title(budget)))
         parts.append(PageText(budget.advice()))
     if rows := _signal_rows(found.signals):
         heads = ("signal", "at", "U (95 %)", "k", "unit", "largest component")
@@ -37,19 +36,18 @@ def _signal_rows(budgets: Mapping[str, Budget]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for name, budget in budgets.items():
         if budget.stated:
-            factor, unit = fitting_prefix(budget.unit, budget.value, least=0.1)
-            value, expanded = rounded(factor * budget.value, factor * budget.expanded)
-            rows.append((name, value, expanded, f"{budget.factor:.2f}", unit, budget.rows[0].label))
+            shown = budget.in_fitting_unit()
+            value, expanded = rounded(shown.value, shown.expanded)
+            rows.append((name, value, expanded, f"{shown.factor:.2f}", shown.unit, shown.rows[0].label))
     return rows
 
 
 def budget_title(budget: Budget) -> str:
     """Return the value of a budget with its expanded uncertainty."""
-    factor, unit = fitting_prefix(budget.unit, budget.value, least=0.1)
-    value, expanded = rounded(factor * budget.value, factor * budget.expanded)
-    shown = "" if unit == "1" else f" {unit}"
+    value, expanded = rounded(budget.value, budget.expanded)
+    unit = "" if budget.unit == "1" else f" {budget.unit}"
     return (
-        f"budget of {budget.signal}: ({value} ± {expanded}){shown}; 95 %, k = {budget.factor:.2f}, "
+        f"budget of {budget.signal}: ({value} ± {expanded}){unit}; 95 %, k = {budget.factor:.2f}, "
         f"ν = {_freedom(budget.freedom)}"
     )
 
@@ -58,8 +56,13 @@ def _freedom(freedom: float) -> str:
     return f"{freedom:.0f}" if freedom < _MANY else "∞"
 
 
+def budget_heads(budget: Budget) -> tuple[str, ...]:
+    """Return the heads over the rows of a budget; `part` is the sensitivity times u."""
+    return ("component", "type", "u", "sensitivity", "ν", with_unit("part", budget.unit), "%")
+
+
 def budget_rows(budget: Budget) -> list[tuple[str, ...]]:
-    """Return the components of a budget, the largest first; `part` is the sensitivity times u, in its unit."""
+    """Return the components of a budget, the largest first."""
     return [
         (
             row.label,

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from bench.analysis.report.uncertainty_tables import BUDGET_HEADS, budget_rows, budget_title
+from bench.analysis.report.uncertainty_tables import budget_heads, budget_rows, budget_title
 from bench.rig import UncertainSignals, load_rig
 
 PAGE = Path(__file__).parents[3] / "docs/explanation/uncertainty.md"
@@ -69,7 +69,7 @@ def test_the_budget_by_hand_equals_that_of_the_bench_to_the_last_digit(budget):
 def test_the_page_shows_both(budget):
     page = PAGE.read_text(encoding="utf-8")
     assert budget_title(budget) in page
-    for cells in (BUDGET_HEADS, *budget_rows(budget)):
+    for cells in (budget_heads(budget), *budget_rows(budget)):
         assert f"| {' | '.join(cells)} |" in page
     curvature, rows, parts, combined, factor = by_hand()
     shown = [curvature, *parts[:4], combined]

@@ -192,6 +192,19 @@ def test_a_value_is_the_same_whether_it_is_read_or_asked_for():
     assert asked.standard == pytest.approx(read.standard, rel=1e-6)
 
 
+def test_people_read_a_budget_in_the_unit_that_fits_its_value():
+    budget = signals(spot=PSD).reading("spot", {"spot": 7e-5}).budget()
+    shown = budget.in_fitting_unit()
+    assert (shown.unit, shown.value) == ("µm", pytest.approx(70.0))
+    assert shown.expanded == pytest.approx(1e6 * budget.expanded)
+    assert shown.factor == pytest.approx(budget.factor)
+    for before, after in zip(budget.rows, shown.rows, strict=True):
+        assert after.contribution == pytest.approx(1e6 * before.contribution)
+        # The gain stays in percent.
+        assert after.unit == ("µm" if before.unit == "m" else before.unit)
+    assert f"{shown.expanded:.2g} µm" in shown.advice()
+
+
 def test_what_is_not_stated_is_named():
     found = signals(spot=PSD, units={**UNITS, "other": "V"})
     assert found.stated(["spot", "curvature", "other"]) == ["spot", "curvature"]
