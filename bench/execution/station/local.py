@@ -119,11 +119,7 @@ class LocalStation(Station):
                 for actuator, value in changed:
                     actuator.check(value)
             for actuator, value in changed:
-                try:
-                    actuator.set(value)
-                except DeviceConnectionError as error:
-                    self._reconnect(actuator.name, error)
-                    actuator.set(value)
+                self._ask(actuator.name, partial(actuator.set, value))
 
         return move
 

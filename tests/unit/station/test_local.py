@@ -75,6 +75,16 @@ class TestReconnection:
         assert "tec: line lost for " in news.text
         assert station.news() == []
 
+    def test_a_setpoint_of_a_fast_loop_waits_for_its_line(self, vo2):
+        station, tec, _ = vo2()
+        move = station.mover(["tec"])
+        move([40.0])
+        tec.unplug()
+        station.clock.after(2.0, tec.plug_in)
+        move([41.0])
+        assert station.setpoint("tec") == 41.0
+        assert [news.kind for news in station.news()] == ["line"]
+
     def test_a_line_that_is_lost_at_every_reading_has_the_devices_read_three_times(self, vo2, monkeypatch):
         station, tec, rig = vo2()
         psd, read = rig.devices["psd"], []
