@@ -34,6 +34,7 @@ from bench.analysis import (
     calibrate_run,
     control_uncertainties,
     identify_model,
+    input_and_output,
     read_dataset,
     target_results,
     transients_of,
@@ -248,7 +249,7 @@ class Identified:
         """Return the budgets of what a session identifies."""
         trial = self._trial
         run = carry_out("damped-oscillation", trial, self._folder, seed, overrides, **trial.settings)
-        data = read_dataset([run.folder], ColumnNames(run.signal_of("drive"), run.signal_of("response")))
+        data = read_dataset([run.folder], ColumnNames(*input_and_output(run.folder, ("", ""))))
         self._transients = self._transients or transients_of(data)
         model = identify_model(data, trial.model, FitOptions.of(dict(trial.options)), self._transients)
         if not (file := self._folder / "model.json").exists():
