@@ -85,7 +85,7 @@ def test_from_characterization_to_report(run, bench, tmp_path, rig):
     low, high = load_rig(rig).roles["response"].range
 
     dwell = {"dwell": case.dwell}
-    characterization, steps = run("damped-oscillation", rig, half_cycles=4, increment=case.increment, **dwell)
+    characterization, steps = run("damped-oscillation", rig, half_cycles=6, increment=case.increment, **dwell)
     # The drive goes where it is sent, and the response over most of what the rig says of it.
     assert np.ptp(steps[case.drive]) > 0.95 * np.ptp(steps[case.setpoint][1:])
     assert np.ptp(steps[case.response]) > 0.7 * (high - low)
@@ -100,12 +100,12 @@ def test_from_characterization_to_report(run, bench, tmp_path, rig):
     _, validation = run("random-validation", rig, count=10, **dwell)
     assert len(validation) >= 4
 
-    tracking, steps = run("tracking", rig, model=model, controller="closed-loop-inverse", count=3)
+    tracking, steps = run("tracking", rig, model=model, controller="closed-loop-inverse", count=5)
     assert {"reference", "predicted", "disturbance"} <= set(steps.columns)
     with Record(tracking) as record:
         results = target_results(record, case.response)
     rms = 100 * results.summary()["rms"] / (high - low)
-    assert len(results.targets) == 3
+    assert len(results.targets) == 5
     assert rms < case.bound
 
     code, text, err = bench("report", tracking)
