@@ -71,6 +71,10 @@ MOST_STRAY = 4096
 
 _LONGEST_PIECE = 256  # bytes that are discarded at once
 _HELD = (errno.EAGAIN, errno.EBUSY)
+_CURES = {
+    errno.ENOENT: "; see that the adapter is plugged in; `bench rig find` shows what is at which port",
+    errno.EACCES: "; add yourself to the group of the port (dialout on most systems), and log in again",
+}
 
 
 class PatientPort:
@@ -428,7 +432,12 @@ def cannot_open(device: str, port: str, error: BaseException) -> DeviceConnectio
     """Return the error for a port that could not be opened; a library's own error gives its cause."""
     while error.__cause__ is not None:
         error = error.__cause__
-    why = _use_of(port) if getattr(error, "errno", None) in _HELD else error
+    number, why = getattr(error, "errno", None), str(error)
+    if number in _HELD:
+        why = _use_of(port)
+    elif number:
+        # pyserial's own text says port and cause twice.
+        why = os.strerror(number) + _CURES.get(number, "")
     return DeviceConnectionError(device, f"cannot open {port}: {why}")
 
 
