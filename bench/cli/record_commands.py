@@ -15,7 +15,7 @@ from bench.base import ConfigurationError, RecordError, aligned, counted, format
 from bench.cli.command_support import FigureFormatOption, JsonOption, check_outputs, parse_assignments, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.printing import console, show_compilation
-from bench.cli.run_names import BEFORE, NEWEST, RunArgument
+from bench.cli.run_names import BEFORE, NEWEST, NO_RUNS, RECORDINGS, RunArgument
 
 if TYPE_CHECKING:
     from bench.analysis import ListedRun
@@ -92,9 +92,7 @@ _STYLES = {"completed": "", "running": "green", "unfinished": "yellow"}
 
 
 def runs_(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to look, at any depth.")] = Path(
-        "recordings"
-    ),
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to look, at any depth.")] = RECORDINGS,
     where: Annotated[
         list[str] | None,
         typer.Option(
@@ -118,7 +116,8 @@ def runs_(
     """
     from bench.analysis import list_runs, select_runs
 
-    runs = list_runs(folder)
+    # The first run makes it.
+    runs = [] if folder == RECORDINGS and not folder.exists() else list_runs(folder)
     _check_named("--protocol", protocol, [run.protocol for run in runs])
     _check_named("--rig", rig, [run.rig for run in runs])
     found = select_runs(
@@ -128,8 +127,9 @@ def runs_(
         protocol=protocol,
         rig=rig,
     )
-    _print_runs(folder, found)
-    console.print(counted(len(found), "run"))
+    if runs:
+        _print_runs(folder, found)
+    console.print(counted(len(found), "run") if runs else f"{folder} {NO_RUNS}")
     write_json(json_file, [run.to_json() for run in found])
 
 

@@ -16,6 +16,9 @@ from bench.cli.printing import error_console
 RECORDINGS = Path("recordings")
 """Where runs are looked for by name."""
 
+NO_RUNS = "has no runs; bench run makes one"
+"""What is said of a folder without any."""
+
 NEWEST = Path("@1")
 BEFORE = Path("@2")
 
@@ -42,7 +45,7 @@ def find_run(given: str | Path) -> Path:
     if match := re.fullmatch(r"@(\d+)", text):
         runs, number = newest_runs(RECORDINGS), int(match[1])
         if not 1 <= number <= len(runs):
-            there = f"has {counted(len(runs), 'run')}" if runs else "has no runs; bench run makes one"
+            there = f"has {counted(len(runs), 'run')}" if runs else NO_RUNS
             raise ConfigurationError(f"{text}: {RECORDINGS} {there}" if text != "@1" else f"{RECORDINGS} {there}")
         error_console.print(f"run: {runs[number - 1]}", style="dim", soft_wrap=True)
         return runs[number - 1]

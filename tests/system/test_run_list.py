@@ -115,6 +115,13 @@ def test_what_cannot_be_found_is_named(bench, runs, tmp_path):
     assert "nowhere is not a folder" in err
 
 
+def test_where_nothing_has_run_there_are_no_runs(bench, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, text, _ = bench("runs")
+    assert code == 0
+    assert "no runs" in text
+
+
 def test_the_folder_tells_the_parameters_that_differ(runs):
     assert runs["hotter"].name.startswith("heater-stairs-count-3-increment-7.5-2")
     assert runs["plain"].name.startswith("heater-stairs-2")
