@@ -119,6 +119,9 @@ def tune(
 
     # What each of many runs says of itself would hide what the search says.
     kernels = ("bench.models", "bench.control", *getattr(tuned_on.laboratory, "kernels", ()))
+    made = wall_time()
+    # An earlier tuning keeps its runs.
+    folder /= f"{controller}-{made:%Y%m%d-%H%M%S}"
     with opened_folder(folder), Workers(workers, title=f"tune {controller}", kernels=kernels) as pool:
         runs = TuningRuns(task, on, file, folder, pool, given, seeds, time_weight=time_weight)
         best = search(begin, spec.tunable, runs, tell, rounds)
@@ -144,7 +147,7 @@ def tune(
         "trials": len(trials),
         "seeds": seeds,
         "checks": checks,
-        "made": wall_time().isoformat(timespec="seconds"),
+        "made": made.isoformat(timespec="seconds"),
         "bench": importlib.metadata.version("actuator-bench"),
     }
     return Tuned(task, on, first, best, len(trials), dict(tables), provenance)
