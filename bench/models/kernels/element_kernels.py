@@ -30,6 +30,15 @@ _LIMIT = 1e6
 
 
 @kernel
+def tanh(values: Floats) -> Floats:
+    """Return the hyperbolic tangent of each value by the C library, as exported C does; numpy's differs by 3 ulp."""
+    result = np.empty(values.size)
+    for k in range(values.size):
+        result[k] = math.tanh(values[k])
+    return result
+
+
+@kernel
 def stops(inputs: Floats, present: float, limits: Fixed, state: Floats) -> Floats:
     """Step stops through `inputs`; return their states sample by sample. `state` is changed."""
     result = np.empty((inputs.size, state.size))

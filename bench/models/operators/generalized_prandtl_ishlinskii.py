@@ -44,8 +44,10 @@ class Envelope(NamedTuple):
 
     def __call__(self, x: Floats) -> Floats:
         """Return the map of each value."""
+        from bench.models.kernels import element_kernels as _kernels
+
         low, high = self.ends()
-        values = np.tanh(self.steepness * x - self.offset)
+        values = _kernels.tanh(self.steepness * x - self.offset)
         return np.asarray((2.0 * values - low - high) / (high - low))
 
     def inverse(self, drive: float) -> float:
