@@ -30,6 +30,13 @@ _PROTOCOLS = {"follow": "following", "target": "tracking"}
 """Which protocol carries a task out, and has the numbers of its controllers in the rig file."""
 CONTROLLERS = tuple(f"{task}.{name}" for task in _PROTOCOLS for name in ("closed-loop-inverse", "open-loop-inverse"))
 """Those that can be exported: the task and the name."""
+_REASONS = {
+    "integral": "it uses no model, and is one line: set-point += gain * period * (reference - output), within limits",
+    "latched": "there is no C for its search from both sides of a target",
+    "polynomial": "its model has no memory, and its inverse is a table of 4001 points",
+    "predictive": "it needs the reference ahead, and solves a problem of bounded least squares in each period",
+}
+"""Why others cannot be, by name."""
 _FIRST = 1e9
 """Variance before the first reading, in variances of a period. Source: `DisturbanceEstimator`."""
 _CLOSE = {"double": 1e-9, "float": 1e-5}
@@ -78,7 +85,10 @@ class Controller:
 
     def __post_init__(self) -> None:
         if self.name not in CONTROLLERS:
-            raise ConfigurationError(f"--controller {self.name}: expected one of {', '.join(CONTROLLERS)}")
+            reason = _REASONS.get(self.name.rpartition(".")[2], "there is no C for it")
+            raise ConfigurationError(
+                f"--controller {self.name} cannot be exported: {reason}; what can be: {', '.join(CONTROLLERS)}"
+            )
         if not 0.0 < self.period < math.inf:
             raise ConfigurationError(f"--period {self.period:g}: expected a positive time, s")
         low, high = self.limits

@@ -5,7 +5,7 @@ import pytest
 from deployed import REACH, Compiled, plane
 
 from bench.base import ConfigurationError, DataError
-from bench.control import ControllerSetup, make_controller
+from bench.control import ControllerSetup, controller_names, make_controller
 from bench.deployment import CONTROLLERS, Controller, controller_of_rig, deploy
 from bench.identification import ModelFile
 from bench.models import IdentifiedDynamics, ResponseDynamics, TwoStage
@@ -122,7 +122,16 @@ def test_what_is_wrong_is_said():
             deploy(file, controller=Controller(name, PERIOD, limits, 0.0, numbers))
         return str(raised.value)
 
-    assert "follow.open-loop-inverse, target.closed" in said(ConfigurationError, name="integral")
+    for task, name, reason in [
+        ("follow", "predictive", "least squares"),
+        ("follow", "integral", "no model"),
+        ("target", "latched", "both sides"),
+        ("target", "polynomial", "no memory"),
+    ]:
+        assert name in controller_names(task)
+        refusal = said(ConfigurationError, name=f"{task}.{name}")
+        assert reason in refusal
+        assert "follow.open-loop-inverse, target.closed" in refusal
     assert "gain: there is no such number" in said(ConfigurationError, gain=1.0)
     assert "overlap" in said(ConfigurationError, limits=(20.0, 30.0))
     assert "[roles.drive] dwell" in said(ConfigurationError, name="target.open-loop-inverse")
