@@ -8,11 +8,11 @@ docs/reference/deploy.md; `speed` the time of a step beside that of the compiled
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -91,21 +91,23 @@ def _counts(model: Operator, probes: list[Probe]) -> tuple[np.ndarray, np.ndarra
 
 
 def speed(steps: int) -> None:
-    """Print the time of a step in C and in the compiled kernel, by turns, the best of ten; for this processor."""
+    """Print the time of a step in C and in the compiled kernel, for this processor: medians of turns by pairs."""
     print(f"{'family':32}{'C, ns':>8}{'Python, ns':>12}{'ratio':>8}")
     for family in RANDOM:
         model = RANDOM[family](np.random.default_rng(5))
         inputs = random_sequence(*model.input_range, steps, 1)
         with tempfile.TemporaryDirectory() as folder:
             compiled = Compiled(ModelFile(family, model), Path(folder), "double", "gcc", "-O3", "-march=native")
-            taken = dict.fromkeys((compiled.steps, model.evaluate), math.inf)
-            for _ in range(10):
-                for run, best in taken.items():
-                    begin = time.perf_counter()
-                    run(inputs)
-                    taken[run] = min(best, 1e9 * (time.perf_counter() - begin) / steps)
-        ours, theirs = taken.values()
-        print(f"{family:32}{ours:8.1f}{theirs:12.1f}{ours / theirs:8.2f}")
+            turns = np.array([[_taken(run, inputs) for run in (compiled.steps, model.evaluate)] for _ in range(40)])
+        (ours, theirs), ratio = np.median(turns[1:], axis=0), np.median(turns[1:, 0] / turns[1:, 1])
+        print(f"{family:32}{ours:8.1f}{theirs:12.1f}{ratio:8.2f}")
+
+
+def _taken(run: Callable[[np.ndarray], object], inputs: np.ndarray) -> float:
+    """Return the time of a step, ns."""
+    begin = time.perf_counter()
+    run(inputs)
+    return 1e9 * (time.perf_counter() - begin) / inputs.size
 
 
 def main() -> None:

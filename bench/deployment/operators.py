@@ -39,7 +39,7 @@ _STEPS = 4096
 """Steps of integration within one move. Derivation: a move through the range takes some 100."""
 
 _MACHINE_CODE = {
-    "preisach.c.in": 8000,
+    "preisach.c.in": 8200,
     "prandtl_ishlinskii.c.in": 2500,
     "generalized_prandtl_ishlinskii.c.in": 3500,
     "maxwell_slip.c.in": 3000,
@@ -174,13 +174,7 @@ def _preisach(model: Preisach, starts: Starts, real: Real, prefix: str, base: st
     operator = inverse.operator
     lattice = operator.lattice
     order, room = operator.order, max(_LEAST_ROOM, 2 * operator.order + 2)
-    pieces: list[float] = []
-    places, inputs = [], []
-    for state in starts:
-        left, height, _ = state.staircase(*operator.plane)
-        places.append([len(pieces) // 2, len(left)])
-        pieces += np.column_stack([left, height]).ravel().tolist() if left else []
-        inputs.append(state.input)
+    ways = [[operator.plane[state.saturation > 0], *state.extrema, state.input] for state in starts]
     low, high = operator.input_range
     numbers: _Numbers = {
         "levels": lattice.levels,
@@ -197,9 +191,8 @@ def _preisach(model: Preisach, starts: Starts, real: Real, prefix: str, base: st
         "gains": inverse.gains,
         "least": inverse.branches[:, 2].min(),
         "greatest": inverse.branches[:, 3].max(),
-        "pieces": np.array([*pieces, 0.0, 0.0]),
-        "starts": np.array(places),
-        "inputs": np.array(inputs),
+        "inputs": np.concatenate(ways),
+        "starts": np.cumsum([0, *map(len, ways)]),
     }
     rises, points = operator.rises(), 0
     if not rises:

@@ -226,7 +226,7 @@ def test_clang_takes_it_and_no_sanitizer_complains(family, clang, gcc, tmp_path)
     assert "met" in run(["./example"], tmp_path)
 
 
-@pytest.mark.parametrize(("kind", "most"), [("", 6000), ("thermal", 12_000), ("signed", 12_000)])
+@pytest.mark.parametrize(("kind", "most"), [("", 6000), ("thermal", 8000), ("signed", 8000)])
 def test_steps_and_inverses_of_40_levels_are_bounded(kind, most, valgrind, gcc, tmp_path):
     model = plane(40, kind)
     deploy(ModelFile("plane", model)).write(tmp_path)
