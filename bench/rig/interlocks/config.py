@@ -37,7 +37,7 @@ from __future__ import annotations
 import math
 from enum import StrEnum
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from bench.base import CheckedTable
 
@@ -69,8 +69,6 @@ class Stuck(CheckedTable):
 class Interlock(CheckedTable):
     """What a signal may not do while a run goes on. A value that is nan counts as outside of any range."""
 
-    model_config = ConfigDict(allow_inf_nan=True)
-
     signal: str = Field(description="signal that is watched")
     low: float = Field(default=-math.inf, description="smallest value allowed, in the signal's unit")
     high: float = Field(default=math.inf, description="largest value allowed, in the signal's unit")
@@ -78,10 +76,10 @@ class Interlock(CheckedTable):
         default=0.0, ge=0, le=3600, description="how long it may be outside, or change too fast, before it acts, s"
     )
     resume_low: float | None = Field(
-        default=None, allow_inf_nan=False, description="once below low, it is outside until it has reached this"
+        default=None, description="once below low, it is outside until it has reached this"
     )
     resume_high: float | None = Field(
-        default=None, allow_inf_nan=False, description="once above high, it is outside until it has come down to this"
+        default=None, description="once above high, it is outside until it has come down to this"
     )
     minus: str = Field(default="", description="signal that is subtracted from it before it is compared")
     unit: str = Field(default="", description="unit in which the numbers are meant, checked against the signal's")
@@ -93,7 +91,7 @@ class Interlock(CheckedTable):
         description="time after a set-point has changed during which range and rate do not act, s",
     )
     fastest: float | None = Field(
-        default=None, gt=0, allow_inf_nan=False, description="largest rate of change allowed, the signal's unit per s"
+        default=None, gt=0, description="largest rate of change allowed, the signal's unit per s"
     )
     over: float = Field(default=1.0, ge=0.01, le=3600, description="time over which the rate is taken, s")
     stale: float | None = Field(

@@ -33,6 +33,7 @@ class TestInterlock:
             {},
             {"low": 2.0, "high": 1.0},
             {"low": math.nan},
+            {"low": 1.0, "high": math.inf},
             {"high": 1.0, "seconds": -1.0},
             {"high": 1.0, "seconds": 1e6},
             {"high": 1.0, "warn": 0.51},
