@@ -248,7 +248,7 @@ class _Expander:
             "code": code_digest(),
             "rig": known.digest,
             "protocol": [definition.name, source],
-            # Of a file its content counts, not its place.
+            # The content of a file determines the results, not its place.
             "parameters": parameters.model_dump(mode="json", exclude={*inputs, *referred}),
             "inputs": {key: self._digest(Path(path)) for key, path in inputs.items()},
             "interlock_rate": table.interlock_rate,
@@ -441,7 +441,7 @@ def _protocol_and_digest(path: str) -> tuple[ProtocolDefinition, str]:
 
 @contextmanager
 def _said_at(where: str) -> Iterator[None]:
-    """Say of what is wrong in the file at which place it is."""
+    """Put the place in the file before the text of a ConfigurationError."""
     try:
         yield
     except ConfigurationError as error:

@@ -1,4 +1,4 @@
-"""What a campaign reads beside its own file: programs, rig files, faults, data; their hashes."""
+"""The files that a campaign reads beside its own, such as programs, rig files, faults and data, and their hashes."""
 
 from __future__ import annotations
 

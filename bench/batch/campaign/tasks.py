@@ -223,7 +223,7 @@ class RunTask(CampaignTask):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What it has on each axis of its table, by the name of the axis; of models their labels."""
+        """The value on each axis of its table, by the name of the axis; a model is given by its label."""
         return {
             "protocol": Path(self.protocol).name,
             "rig": Path(self.rig).stem,

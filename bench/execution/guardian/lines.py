@@ -167,7 +167,7 @@ class LineThreads:
         _answer(call, result)
 
     def _miss(self, call: _Call, lost: DeviceConnectionError, since: float, away: list[str]) -> None:
-        """Look for the device of a call that has failed, and began then."""
+        """Look for the device of a call that has failed; the call began at `since`, s."""
         device = call.device
         try:
             absence = Absence(self._devices[device], lost, self._clock, self._longest(device), since)
